@@ -177,7 +177,8 @@ def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
                 if pose is not None:
                     x, y, yaw = pose.pose
                     sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
-                    text = f"{pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
+                    stale = "" if node.live is None else node.live.status().stale
+                    text = f"{stale or pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
                     line.update(Text(text), refresh=True)
 
         showing = threading.Thread(target=show, name="fgloc-status-line", daemon=True)
@@ -220,7 +221,7 @@ def _summary(node: Node, seconds: float) -> str:
     status = node.live.status()
     rows += [
         ("keyframes", str(status.keyframes)),
-        ("last mode", "no pose was found" if status.mode is None else str(status.mode)),
+        ("last mode", status.stale or ("no pose was found" if status.mode is None else str(status.mode))),
         ("rejected", str(sum(status.rejections.values()))),
     ]
     rows += [(f"undecodable {topic}", str(n)) for topic, n in node.intake.undecodable.items()]

@@ -15,7 +15,7 @@ from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.instrumentation import one_blas_thread
 from fgloc.live.extrapolation import Outlet
-from fgloc.live.run import LiveFacts, OnlineRun, role_name
+from fgloc.live.run import MOTION, LiveFacts, OnlineRun, role_name
 from fgloc.live.state import Resumed, fingerprint, read_state, write_state
 from fgloc.sensors.markers.detector import Detector, use_one_thread
 from fgloc.sensors.markers.images import ImageError
@@ -30,6 +30,8 @@ class TopicStatus:
     count: int
     rate_hz: float  # by receive times, lately
     delay_s: float  # receive time less stamp, lately; of sensors whose clock is another one, the offset is in it
+    silent_s: float = 0.0  # since the last message, by this machine's clock
+    missed: bool = False  # it used to come regularly, and is silent for longer than jitter explains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +53,15 @@ class LiveStatus:
     waiting_for: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()  # what is wrong, one sentence each
     findings: tuple[Finding, ...] = ()  # of sensors, settings and estimate; their sentences are notes too
+
+    @property
+    def stale(self) -> str:
+        """Sentence on motion sources that have all fallen silent, so that the pose is not of now; empty: none has."""
+        motion = {topic: of for topic, of in self.topics.items() if of.role in MOTION}
+        missed = [of.silent_s for of in motion.values() if of.missed]
+        if not missed or min(of.silent_s for of in motion.values()) < min(missed):
+            return ""
+        return f"STALE: no message of {', '.join(motion)} for {min(missed):.1f} s"
 
 
 # --- Marker detection: one worker, and a queue that drops the oldest waiting image ------------------------------------

@@ -38,6 +38,8 @@ _SUCCESSION_NS = (
 
 
 _MEAN_OF = 20  # messages, in the means of their interval and delay
+_clock_s = time.monotonic
+_STALE_S, _STALE_INTERVALS = 0.6, 4.0  # of silence: a wireless link's hiccup is shorter; users hear of it within 1 s
 _REGULAR_S = 1.0  # a topic that comes more often is missed
 
 
@@ -53,6 +55,7 @@ class _TopicMeter:
         self._role = role
         self._count = 0
         self.last_ns = 0
+        self._heard_s = 0.0
         self._interval_s = 0.0
         self._delay_s = 0.0
 
@@ -67,7 +70,7 @@ class _TopicMeter:
         else:
             self._delay_s = delay
         self._count += 1
-        self.last_ns = received_ns
+        self.last_ns, self._heard_s = received_ns, _clock_s()
 
     @property
     def is_regular(self) -> bool:
@@ -77,7 +80,9 @@ class _TopicMeter:
     def status(self) -> TopicStatus:
         """Statistics of the topic up to now."""
         rate = 1.0 / self._interval_s if self._interval_s > 0.0 else 0.0
-        return TopicStatus(self._role, self._count, rate, self._delay_s)
+        silent_s = _clock_s() - self._heard_s
+        missed = self.is_regular and silent_s > max(_STALE_S, _STALE_INTERVALS * self._interval_s)
+        return TopicStatus(self._role, self._count, rate, self._delay_s, silent_s, missed)
 
 
 @dataclass(slots=True)

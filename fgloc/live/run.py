@@ -62,7 +62,7 @@ def role_name(event: Event) -> str:
     return role_of(event) or "tf"
 
 
-_MOTION: frozenset[Role] = frozenset({"odometry", "joints", "command", "imu"})
+MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
 _WITH_CAMERA: frozenset[Role] = frozenset({"image", "sightings"})
 _NOT_BUILT_FROM: frozenset[Role] = frozenset({"camera_info", "truth"})
 
@@ -148,13 +148,13 @@ class LiveFacts:
                 missing.append(f"{role} ({self._topics[role]}): {self._missing(role)}")
             elif self.expected is not None and role in self.expected:
                 missing.append(f"{role}: no message yet")
-        if not _MOTION & set(self.roles):
+        if not set(MOTION) & set(self.roles):
             missing.append("a motion source: odometry, joints, command or imu")
         return tuple(missing)
 
     def complete(self, waited_s: float, patience_s: float) -> bool:
         """Whether the run can be built: a motion source is there, and all that is expected, or the wait is over."""
-        if not _MOTION & set(self.roles):
+        if not set(MOTION) & set(self.roles):
             return False
         if self.expected is not None and self.expected <= set(self.roles):
             return True

@@ -17,6 +17,7 @@ from fgloc.errors import FglocError, WireError
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LiveStatus
 from fgloc.live.process import EstimationProcess
+from fgloc.live.run import MOTION
 from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, odom_in_map
 from fgloc.live.wire.participant import OWN, Participant, Publication, Sample, WireClock
 from fgloc.recording.reader import TF_TYPES, TopicInfo, events_of, select_roles
@@ -26,7 +27,6 @@ from fgloc.types import Estimate, Event, LandmarkMap, Severity
 # --- Intake: topics found by type, selected by role, decoded as those of a recording ----------------------------------
 
 SETTLED_S = 1.0  # no new topic for this long: all of a robot's have been found
-MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
 LOOK: tuple[Role, ...] = ("image", "sightings")
 _TF_TOPICS = ("/tf", "/tf_static")
 _LATCHED = frozenset({"/tf_static"})
@@ -244,7 +244,7 @@ class Node:
         publishing: threading.Thread | None = None
         teller = Teller(tell)
         self.intake.truth = self.watch is not None
-        next_diagnostics_s = time.monotonic()
+        next_diagnostics_s, was_stale = time.monotonic(), False
         try:
             while not stop.wait(_POLL_S):
                 if self._failure is not None:
@@ -261,6 +261,10 @@ class Node:
                     teller.waiting(f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
                     teller.tell(*status.notes)
                 teller.tell(*self._take_notes())
+                stale = "" if status is None else status.stale
+                if bool(stale) != was_stale:
+                    was_stale, next_diagnostics_s = bool(stale), 0.0
+                    tell(f"{stale}." if stale else "Messages come again.")
                 if time.monotonic() >= next_diagnostics_s:
                     next_diagnostics_s = time.monotonic() + 1.0
                     self._diagnose(status)
@@ -378,7 +382,7 @@ class Node:
             self._outputs.transform(odom.stamp_ns, odom_in_map(then, odom.T_odom_base), odom.frame)
 
     def _diagnose(self, status: LiveStatus | None) -> None:
-        mode = None if status is None else status.mode
+        mode = None if status is None or status.stale else status.mode
         message, values = described(status)
         values |= {f"refused {topic}": str(n) for topic, n in self.refused.items()}
         wrong = status is not None and any(f.severity is Severity.ERROR for f in status.findings)
@@ -400,6 +404,8 @@ def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
     values |= {f"rejected {reason}": str(n) for reason, n in status.rejections.items()}
     values |= {f"{f.severity.name.lower()} {f.code}": f.text for f in status.findings if f.severity > Severity.NOTE}
     values |= {f"note {k}": note for k, note in enumerate(status.notes, 1)}
+    if status.stale:
+        return status.stale, values
     if status.mode is not None:
         return str(status.mode), values
     return f"waiting for {'; '.join(status.waiting_for)}" if status.waiting_for else "no pose yet", values

@@ -1,0 +1,46 @@
+"""A live run whose inputs have stopped says so, and since when."""
+
+import pytest
+
+from fgloc.config import Config
+from fgloc.live import Live, live
+from fgloc.live.wire.node import described
+from fgloc.types import ControlEvent
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock of this machine that the test sets."""
+    now = [100.0]
+    monkeypatch.setattr(live, "_clock_s", lambda: now[0])
+    return now
+
+
+def drive(run, clock, seconds, hz=20.0):
+    for _ in range(round(seconds * hz)):
+        at_ns = round(clock[0] * 1e9)
+        run.push(ControlEvent(at_ns, at_ns, "command", 0.2, 0.0))
+        clock[0] += 1.0 / hz
+
+
+def test_silence_of_all_motion_is_stale_within_a_second(clock):
+    with Live(Config(), roles=("command",)) as run:
+        drive(run, clock, 2.0)
+        assert not run.status().stale
+        clock[0] += 0.9
+        status = run.status()
+        assert status.stale.startswith("STALE")
+        assert "command" in status.stale
+        assert described(status)[0] == status.stale
+        (topic,) = status.topics.values()
+        assert topic.missed
+        assert topic.silent_s == pytest.approx(0.95, abs=0.06)
+        drive(run, clock, 0.5)
+        assert not run.status().stale
+
+
+def test_a_slow_topic_is_not_missed_between_two_messages(clock):
+    with Live(Config(), roles=("command",)) as run:
+        drive(run, clock, 20.0, hz=2.0)
+        clock[0] += 0.9
+        assert not run.status().stale
