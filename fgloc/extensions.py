@@ -1,4 +1,4 @@
-"""Sensors of other packages: classes that they declare as entry points of the group ``fgloc.sensors``.
+"""Sensors by entry point: UWB and GNSS of fgloc itself, and those that other packages declare in ``fgloc.sensors``.
 
 What such a class has to offer is in `fgloc.sensors.base`; `fgloc.sensors.registry` looks them up by role and event.
 """
@@ -6,25 +6,30 @@ What such a class has to offer is in `fgloc.sensors.base`; `fgloc.sensors.regist
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from fgloc.errors import ConfigError
 
 GROUP = "fgloc.sensors"
+BUILT_IN = (
+    EntryPoint("uwb", "fgloc.sensors.uwb:Uwb", GROUP),
+    EntryPoint("gnss", "fgloc.sensors.gnss:Gnss", GROUP),
+)
+"""Sensors of fgloc itself that are found in the same way as those of other packages."""
 _NEEDED = ("name", "Config", "streams", "failures", "build", "measure")
 
 
 @cache
 def outside_sensors() -> tuple[type[Any], ...]:
-    """All sensor classes of installed packages, by name.
+    """All sensor classes that are found by entry point, by name: those of fgloc itself first.
 
     Raises:
         ConfigError: one cannot be imported or is no sensor, or two have one name or role.
     """
     found: dict[str, type[Any]] = {}
     roles: dict[str, str] = {}
-    for point in sorted(entry_points(group=GROUP), key=lambda p: (p.name, p.value)):
+    for point in (*BUILT_IN, *sorted(entry_points(group=GROUP), key=lambda p: (p.name, p.value))):
         package = point.dist.name if point.dist is not None else "an installed package"
         where = f"sensor '{point.name}' of {package} ({point.value})"
         try:

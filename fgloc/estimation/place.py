@@ -26,6 +26,7 @@ from fgloc.types import FloatArray, LandmarkMap, MotionMeasurement, MotionReadin
 # Where no place explains the sightings (a wrong map, a robot that is lost) every step tries anew: this bounds its time.
 _MAX_SEEDS = 6  # places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
+_MOST_SENSED = 64  # readings of registered sensors that are weighed together where no pose is known: two rows each
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried
 
 
@@ -43,7 +44,8 @@ class PlaceSearch:
             sightings: as seen from the pose that is looked for.
             known: the robot has an estimated pose elsewhere, so that it takes more to find it here.
         """
-        here = _spread(sightings, MOST_JOINT)
+        sensed = not known and not any(m.of_landmark for m in sightings)
+        here = _spread(sightings, _MOST_SENSED if sensed else MOST_JOINT)
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
             return None  # one landmark alone may have been moved, or misread
         fitted = PoseFit(here, self._factors)
@@ -124,6 +126,7 @@ ANYWHERE = np.diag([FAR_M2, FAR_M2, se2.ANY_YAW])  # the yaw may be any, with eq
 ORIGIN = ROUNDING * np.eye(se2.DOF)  # of a first pose that is the origin by definition
 # After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
 _RETRY_S = 1.0
+_SENSORS_WINDOW_S = 60.0  # positions and ranges without a map tell the yaw by the way: a robot goes 12 m at 0.2 m/s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,6 +173,9 @@ class GlobalSearch:
         self._config = config
         self._keep_all = keep_all
         self._window_ns = round(config.estimator.initialise_s * 1e9)
+        self._unseen_ns = self._window_ns  # as far back as a robot is looked for that has no pose
+        if landmark_map is not None and not len(landmark_map):
+            self._unseen_ns = max(self._window_ns, round(_SENSORS_WINDOW_S * 1e9))
         self._places = PlaceSearch(config, landmark_map, factors)
         self._steps: deque[SearchStep] = deque()
         self._earlier: list[SearchStep] = []  # with keep_all: before those, since the segment began
@@ -217,7 +223,7 @@ class GlobalSearch:
                 place has to be so much more probable.
         """
         self._steps.append(SearchStep(step, tuple(motions), tuple(sightings), readings or MotionReadings()))
-        horizon = step.stamp_ns - self._window_ns
+        horizon = step.stamp_ns - (self._unseen_ns if tracked is None else self._window_ns)
         while self._steps[0].step.stamp_ns < horizon:
             forgotten = self._steps.popleft()
             if self._keep_all and self._first:

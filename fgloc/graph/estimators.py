@@ -752,6 +752,7 @@ def make_estimator(
         poses.landmarks.sees_corners,
         has_gyro=motion.gyro is not None,
         has_model=motion.learned is not None,
+        sensed=[parameter for sensor in poses.registered for parameter in getattr(sensor, "parameters", ())],
     )
     kind = ExtendedKalmanFilter if config.estimator.kind == "ekf" else IncrementalEstimator
     return kind(config.estimator, LandmarkFactors(landmark_map, installation), keep_all)

@@ -16,6 +16,7 @@ import numpy as np
 
 from fgloc.config import Config
 from fgloc.sensors import registry
+from fgloc.sensors.base import Parameter
 from fgloc.stats import PRIOR_GATE, SURE_SIGMAS
 from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 
@@ -209,6 +210,7 @@ def installation_of(
     has_gyro: bool = False,
     most: int = MOST_LANDMARKS,
     has_model: bool = True,
+    sensed: Sequence[Parameter] = (),
 ) -> Installation:
     """The parameters of a run, with their priors.
 
@@ -222,11 +224,12 @@ def installation_of(
         has_gyro: whether there is a gyro.
         most: landmarks of a map that are states; a larger map is taken as exact.
         has_model: whether there is a learned motion.
+        sensed: parameters of registered sensors.
     """
     camera, rb = config.camera, config.landmarks
     there = {"wheels": True, "gyro": has_gyro, "learned": has_model}
     roles = [role for role, is_there in there.items() if is_there]
-    parameters = registry.motion_parameters(config, roles)
+    parameters = (*registry.motion_parameters(config, roles), *sensed)
     sigmas = {parameter.name: parameter.sigma for parameter in parameters}
     effects = _EFFECTS | {parameter.name: parameter.effects for parameter in parameters}
     length = [parameter.name for parameter in parameters if parameter.lengthens]

@@ -490,16 +490,22 @@ class PoseBatch:
         self._seen = seen
         self.rows = [len(m.cov) for m in seen]
         self._whitening = [np.asarray(np.linalg.inv(np.linalg.cholesky(m.cov))) for m in seen]
-        self._columns = np.zeros((len(seen), 0), dtype=np.int64)
+        self._columns = np.full((len(seen), max(len(m.constants) for m in seen)), -1, dtype=np.int64)
+        for i, m in enumerate(seen):  # a constant that is exact is no state: it stays at 0
+            self._columns[i, : len(m.constants)] = [installation.index.get(name, -1) for name in m.constants]
 
     def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
         """All measurements, each at its own pose ``(m, 3)``; rows beyond a measurement's own are 0."""
         n, most = len(poses), max(self.rows)
         residual, J = np.zeros((n, most)), np.zeros((n, most, 3))
+        H = np.zeros((n, most, self._columns.shape[1]))
+        values = np.append(theta, 0.0)[self._columns]
         for i, (m, W, d) in enumerate(zip(self._seen, self._whitening, self.rows, strict=True)):
-            r, by_pose = m.residual_at_keyframe(poses[i])
-            residual[i, :d], J[i, :d] = W @ r, W @ by_pose
-        return Stacked(residual, J, np.zeros((n, most, 0)), self._columns, np.zeros(n, dtype=np.bool_))
+            c = len(m.constants)
+            r, by_pose, by_value = m.by_constants_at_keyframe(poses[i], values[i, :c])
+            residual[i, :d], J[i, :d], H[i, :d, :c] = W @ r, W @ by_pose, W @ by_value
+        H *= (self._columns >= 0)[:, None]
+        return Stacked(residual, J, H, self._columns, np.zeros(n, dtype=np.bool_))
 
     def shared_all(self, stack: Stacked) -> None:
         """Return None, as these measurements have different dimensions."""

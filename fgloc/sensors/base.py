@@ -385,6 +385,9 @@ class Sensor(Protocol):
         streams: what it reads.
         failures: subclasses of `fgloc.sensors.failures.Failure`, for ``fgloc ablate``.
         notes: what the user should know, one sentence each.
+
+    A sensor whose measurements depend on constants (`PoseMeasurement.constants`) has a property ``parameters`` too: a
+    `Parameter` for each, named ``sensor.constant``, with the sigma of its prior about 0.
     """
 
     name: ClassVar[str]

@@ -557,6 +557,7 @@ class PoseMeasurement(ABC):
     cauchy_k: float = 3.0  # Cauchy constant of the search for the first pose, in units of sigma
     T_keyframe_then: FloatArray = field(default_factory=lambda: _AT_REST)  # (3,) base at stamp_ns, by the keyframe
     motion_cov: FloatArray | None = None  # (3, 3) of that motion, right perturbation; None: no motion
+    constants: tuple[str, ...] = ()  # parameters of the installation that `by_constants` takes, as the sensor has them
 
     @abstractmethod
     def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -565,6 +566,14 @@ class PoseMeasurement(ABC):
         Returns:
             The residual, in the units of `cov`, and its derivative ``(d, 3)`` by the right perturbation of the pose.
         """
+
+    def by_constants(self, pose: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Residual ``(d,)`` and Jacobians ``(d, 3)`` by the pose and ``(d, c)`` by the `constants`, at values ``(c,)``.
+
+        The default is for a measurement that depends on no constants. One of 0 changes nothing.
+        """
+        residual, J = self.residual_at(pose)
+        return residual, J, np.zeros((len(residual), 0))
 
     def places(self) -> Iterable[FloatArray]:
         """Rough positions ``(2,)`` [m] of the robot in the map, from which the search for its first pose begins."""
@@ -640,6 +649,13 @@ class PoseMeasurement(ABC):
         """Residual and Jacobian of `residual_at`, by the pose at the keyframe."""
         residual, J = self.residual_at(se2.compose(pose, self.T_keyframe_then))
         return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then)))
+
+    def by_constants_at_keyframe(
+        self, pose: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Residual and Jacobians of `by_constants`, by the pose at the keyframe and the constants."""
+        residual, J, H = self.by_constants(se2.compose(pose, self.T_keyframe_then), values)
+        return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then))), H
 
 
 # --- Those of one kind ------------------------------------------------------------------------------------------------

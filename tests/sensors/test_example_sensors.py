@@ -46,12 +46,12 @@ def folders():
 
 @pytest.fixture(scope="module")
 def uwb(folders):
-    return importlib.import_module("uwb")
+    return importlib.import_module("fgloc.sensors.uwb")
 
 
 @pytest.fixture(scope="module")
 def gnss(folders):
-    return importlib.import_module("gnss")
+    return importlib.import_module("fgloc.sensors.gnss")
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,6 @@
-"""A sensor from outside in one file: ultra-wideband ranges from a tag on the robot to anchors at known places.
+"""Ranges by radio (ultra-wideband or other) from a tag on the robot to anchors at known places.
+
+Found by its entry point, as a sensor of another package is: docs/adding-a-sensor.md goes through this file.
 
 A reading is a `sensor_msgs/Range` whose ``frame_id`` ends in the anchor's number ("anchor_3"). A driver with a message
 of its own needs one more converter. The settings::
@@ -11,6 +13,9 @@ Where something stands between anchor and tag, the pulse arrives late and the ra
 meters. Such a range is told by the chi-square gate, against the prediction. With ``non_line_of_sight: mixture`` it is
 then taken as what it says at least: too long by ``nlos_bias_m``, give or take ``nlos_sigma_m``. With ``reject`` it is
 dropped.
+
+Scale and offset that all ranges have in common are constants of the installation, estimated with the pose: Plaza's
+radios measure 7 % too much, antenna delays of ultra-wideband are worth a decimeter.
 
 Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping".
 """
@@ -28,7 +33,7 @@ from pydantic import Field
 
 from fgloc.config import GateConfig, Section
 from fgloc.errors import ConfigError
-from fgloc.sensors.base import Context, Stream, When
+from fgloc.sensors.base import Context, Parameter, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, SensorEvent
@@ -37,6 +42,7 @@ _NUMBER = re.compile(r"(\d+)$")
 _LEAST_ANCHORS = 3  # that tell a place in the plane
 _AROUND = np.linspace(-math.pi, math.pi, 12, endpoint=False)  # of an anchor: where the search for the first pose begins
 _Metres = Annotated[float, Field(ge=-1e5, le=1e5)]
+SCALE, BIAS = "uwb.range_scale", "uwb.bias_m"
 
 
 # --- Settings ---------------------------------------------------------------------------------------------------------
@@ -51,6 +57,10 @@ class UwbConfig(Section):
     tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
     sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
     bias_m: float = Field(0.0, ge=-10, le=10, description="subtracted from every range: the delay of the antennas")
+    bias_sigma_m: float = Field(0.1, ge=0, le=10, description="how far bias_m may be off; estimated")
+    scale_sigma: float = Field(
+        0.05, ge=0, le=0.5, description="how far reported over true range may be off 1; estimated; 0: exact"
+    )
     non_line_of_sight: Literal["mixture", "reject"] = Field(
         "mixture", description="what becomes of a range that the gate refuses because it is too long"
     )
@@ -95,9 +105,15 @@ class UwbRange(PoseMeasurement):
     anchor: FloatArray  # (3,) in the map
     tag: FloatArray  # (3,) in the base frame
     behind_obstacle: PoseMeasurement | None = None  # the same range, if it is too long
+    constants: tuple[str, ...] = (SCALE, BIAS)
 
     def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Predicted minus measured range ``(1,)``, and its derivative ``(1, 3)`` by the pose."""
+        residual, J, _ = self.by_constants(pose, np.zeros(2))
+        return residual, J
+
+    def by_constants(self, pose: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Residual ``(1,)`` and derivatives by pose ``(1, 3)``, scale [1] and bias [m] ``(1, 2)`` of reported ranges."""
         x, y, yaw = pose
         c, s = math.cos(yaw), math.sin(yaw)
         tag_x, tag_y, tag_z = self.tag
@@ -105,8 +121,9 @@ class UwbRange(PoseMeasurement):
         dy = y + s * tag_x + c * tag_y - self.anchor[1]
         distance = max(math.hypot(dx, dy, tag_z - self.anchor[2]), 1e-6)
         forward, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance  # unit vector in the base's axes
-        J = np.array([[forward, left, left * tag_x - forward * tag_y]])
-        return np.array([distance - self.range_m]), J
+        scale, bias = 1.0 + values[0], values[1]
+        J = scale * np.array([[forward, left, left * tag_x - forward * tag_y]])
+        return np.array([scale * distance + bias - self.range_m]), J, np.array([[distance, 1.0]])
 
     def places(self) -> Iterable[FloatArray]:
         """On the circle about the anchor."""
@@ -205,6 +222,15 @@ class Uwb:
     def _too_long(self, m: UwbRange) -> UwbRange:
         sigma = self._config.nlos_sigma_m
         return replace(m, source="uwb_nlos", range_m=m.range_m - self._config.nlos_bias_m, cov=np.array([[sigma**2]]))
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Scale and offset of all ranges."""
+        config = self._config
+        return (
+            Parameter(SCALE, config.scale_sigma, effects=("length",)),
+            Parameter(BIAS, config.bias_sigma_m),
+        )
 
     @property
     def notes(self) -> tuple[str, ...]:

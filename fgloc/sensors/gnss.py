@@ -1,4 +1,6 @@
-"""A sensor from outside in one file: positions of a GNSS receiver, in a plane about a surveyed origin.
+"""Positions of a GNSS receiver, in a plane about a surveyed origin.
+
+Found by its entry point, as a sensor of another package is (docs/adding-a-sensor.md).
 
 Reads `sensor_msgs/NavSatFix`. The map's frame is a plane that touches the earth at ``origin``; its x axis is turned by
 ``yaw_rad`` from east, counter-clockwise. The settings::
