@@ -53,7 +53,10 @@ def found_values(
     - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
     """
     motion = [row for made in registry.MOTION_INSTALLATIONS for row in made.found(config)]
-    out = _values([*motion, *_sighting_rows()], installation, belief)
+    sensed = [
+        (row.name, row.parameter, row.at, row.gain) for s in registry.sensors() for row in getattr(s, "found", ())
+    ]
+    out = _values([*motion, *sensed, *_sighting_rows()], installation, belief)
     if camera is not None and "camera" in installation.blocks:
         first = installation.blocks["camera"][0]
         out |= mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])

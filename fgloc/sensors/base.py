@@ -387,7 +387,8 @@ class Sensor(Protocol):
         notes: what the user should know, one sentence each.
 
     A sensor whose measurements depend on constants (`PoseMeasurement.constants`) has a property ``parameters`` too: a
-    `Parameter` for each, named ``sensor.constant``, with the sigma of its prior about 0.
+    `Parameter` for each, named ``sensor.constant``, with the sigma of its prior about 0; a tuple ``found`` of
+    `FoundRow` brings them into ``metrics.json``.
     """
 
     name: ClassVar[str]

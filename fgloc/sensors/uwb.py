@@ -33,7 +33,7 @@ from pydantic import Field
 
 from fgloc.config import GateConfig, Section
 from fgloc.errors import ConfigError
-from fgloc.sensors.base import Context, Parameter, Stream, When
+from fgloc.sensors.base import Context, FoundRow, Parameter, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, SensorEvent
@@ -113,7 +113,7 @@ class UwbRange(PoseMeasurement):
         return residual, J
 
     def by_constants(self, pose: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Residual ``(1,)`` and derivatives by pose ``(1, 3)``, scale [1] and bias [m] ``(1, 2)`` of reported ranges."""
+        """Residual ``(1,)`` and derivatives by pose ``(1, 3)``, scale and bias [m] of ranges ``(1, 2)``."""
         x, y, yaw = pose
         c, s = math.cos(yaw), math.sin(yaw)
         tag_x, tag_y, tag_z = self.tag
@@ -172,6 +172,7 @@ class Uwb:
         Stream("uwb", UwbEvent, {"sensor_msgs/msg/Range": from_range}, ("uwb", "uwb/range"), False, check),
     )
     failures: ClassVar[tuple[type[Section], ...]] = (NonLineOfSight,)
+    found: ClassVar[tuple[FoundRow, ...]] = (FoundRow(SCALE, SCALE, 1.0, 1.0), FoundRow(BIAS, BIAS, 0.0, 1.0))
 
     def __init__(self, config: UwbConfig) -> None:
         self._config = config

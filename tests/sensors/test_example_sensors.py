@@ -169,6 +169,18 @@ def test_jacobians_are_the_residuals_derivatives(uwb, gnss, which, moved):
         np.testing.assert_allclose(J[:, i], (ahead - behind) / 2e-6, atol=1e-6)
 
 
+def test_derivatives_by_scale_and_offset_of_ranges(uwb):
+    m = range_of(uwb).compensated(np.array([-0.08, 0.01, 0.05]), 1e-4 * np.eye(3))
+    pose, values = np.array([1.2, 2.3, 0.7]), np.array([0.04, -0.1])
+    _, J, H = m.by_constants_at_keyframe(pose, values)
+    for i, d in enumerate(1e-6 * np.eye(2)):
+        ahead, behind = (m.by_constants_at_keyframe(pose, values + sign * d)[0] for sign in (1.0, -1.0))
+        np.testing.assert_allclose(H[:, i], (ahead - behind) / 2e-6, atol=1e-6)
+    for i, d in enumerate(1e-6 * np.eye(3)):
+        ahead, behind = (m.by_constants_at_keyframe(se2.compose(pose, se2.exp(s * d)), values)[0] for s in (1.0, -1.0))
+        np.testing.assert_allclose(J[:, i], (ahead - behind) / 2e-6, atol=1e-6)
+
+
 def test_range_is_that_from_the_tag_to_the_anchor(uwb):
     m = range_of(uwb)
     residual, _ = m.residual_at(np.array([1.0, 2.0, math.pi / 2]))
