@@ -47,6 +47,7 @@ from fgloc.sensors.wheels.sensor import settings_of
 from fgloc.types import ControlEvent, Finding, FloatArray, LandmarkMap, Severity
 
 _LATE_S = 0.03  # less is within what drivers mean by a stamp
+_RESPONSE_S = 0.1  # a robot follows its commands with a lag of its own, which is no clock's
 _LATE_SIGMAS = 4.0  # of a lag that is corrected: its sigma is the larger of two jackknives
 _BOTH_SIGMAS = 2.5  # of each of two lags that are alike: one clock is late, and they are corrected by their mean
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
@@ -1313,7 +1314,7 @@ def _truth_lines(found: Conventions, fit: BodyFit) -> Iterator[tuple[str, str, d
             {"truth.scale": round(section.scale * factor, 6)},
             fit.scale,
         )
-    if fit.late_s.off(0.0, _LATE_S, _LAG_SIGMAS) and fit.share > FOLLOWS:
+    if fit.late_s.off(0.0, _RESPONSE_S if found.commanded else _LATE_S, _LAG_SIGMAS) and fit.share > FOLLOWS:
         given = {str(r): o for r, o in found.config.recording.stamp_offset_s.items()}.get("truth", 0.0)
         side = "late" if fit.late_s.value > 0 else "early"
         yield (
