@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fgloc.config import BUILT_IN_ROLES, Config, Role
 from fgloc.errors import RecordingError
+from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.reader import HEADERLESS, TF_TYPES, Recording, TopicInfo
 from fgloc.sensors import registry
@@ -339,7 +340,7 @@ def inspect_recording(
         problems=recording.problems,
         found=(
             *note("recording", findings, Severity.WARNING),
-            *note("recording.unused", _unused(recording), Severity.NOTE),
+            *note("recording.unused", _unused(recording, config), Severity.NOTE),
         ),
         notes=recording.notes,
     )
@@ -416,12 +417,22 @@ def unread_map(recording: Recording) -> str | None:
     )
 
 
-def _unused(recording: Recording) -> list[str]:
-    """Sentences on topics that hold the robot's position, and that nothing here reads."""
-    return [
+def _unused(recording: Recording, config: Config) -> list[str]:
+    """Sentences on topics that hold the robot's position, and that nothing here reads, or nothing as configured."""
+    unread = [
         f"{t.name} ({t.message_type}) is not used: nothing here reads {_UNREAD[kind]}."
         for t in recording.topics
         if t.count and t.role is None and (kind := t.message_type.rpartition("/")[2]) in _UNREAD
+    ]
+    sections = {
+        t: getattr(config, str(t.role))
+        for t in recording.topics
+        if t.count and t.role in {sensor.name for sensor in outside_sensors()}
+    }
+    return unread + [
+        f"{t.name} ({t.message_type}) is not used: it needs the section {t.role} of robot.yaml."
+        for t, section in sections.items()
+        if section == type(section)()
     ]
 
 
