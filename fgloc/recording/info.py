@@ -409,7 +409,7 @@ def unread_map(recording: Recording) -> str | None:
     """
     if recording.roles.keys() - _NO_PLACE:
         return None
-    unread = " ".join(_unused(recording))
+    unread = " ".join(_unused(recording, config))
     return (
         "A map is given, but the recording has no images and no sightings that are read: the run is dead reckoning, "
         f"and where on the map it takes place is not known.{' ' + unread if unread else ''} Run it without the map, or "
