@@ -409,7 +409,7 @@ def unread_map(recording: Recording) -> str | None:
     """
     if recording.roles.keys() - _NO_PLACE:
         return None
-    unread = " ".join(_unused(recording, config))
+    unread = " ".join(_unused(recording))
     return (
         "A map is given, but the recording has no images and no sightings that are read: the run is dead reckoning, "
         f"and where on the map it takes place is not known.{' ' + unread if unread else ''} Run it without the map, or "
@@ -417,23 +417,22 @@ def unread_map(recording: Recording) -> str | None:
     )
 
 
-def _unused(recording: Recording, config: Config) -> list[str]:
-    """Sentences on topics that hold the robot's position, and that nothing here reads, or nothing as configured."""
+def _unused(recording: Recording, config: Config | None = None) -> list[str]:
+    """Sentences on topics that hold the robot's position, and that nothing reads, or nothing as it is configured."""
     unread = [
         f"{t.name} ({t.message_type}) is not used: nothing here reads {_UNREAD[kind]}."
         for t in recording.topics
         if t.count and t.role is None and (kind := t.message_type.rpartition("/")[2]) in _UNREAD
     ]
-    sections = {
-        t: getattr(config, str(t.role))
-        for t in recording.topics
-        if t.count and t.role in {sensor.name for sensor in outside_sensors()}
-    }
-    return unread + [
-        f"{t.name} ({t.message_type}) is not used: it needs the section {t.role} of robot.yaml."
-        for t, section in sections.items()
-        if section == type(section)()
-    ]
+    roles = set() if config is None else {sensor.name for sensor in outside_sensors()}
+    for topic in recording.topics:
+        if topic.count and topic.role in roles:
+            section = getattr(config, str(topic.role), None)
+            if section is None or section == type(section)():
+                unread.append(
+                    f"{topic.name} ({topic.message_type}) is not used: it needs the section {topic.role} of robot.yaml."
+                )
+    return unread
 
 
 def _mounting(recording: Recording, bases: tuple[str, ...], frame: str, camera: bool) -> list[str]:
