@@ -205,7 +205,7 @@ def test_fault_40_wrong_marker_size_and_focal_length(wrong):
 def test_fault_40_wrong_range_scale():
     found = alone(diagnose(events(beacons(), stretch=1.08), beacons()), "sightings.scale")
     assert abs(found.value - 1 / 1.08) < 4.0 * found.sigma < 0.06
-    assert float(found.lines["landmarks.range_scale"]) == pytest.approx(1 / 1.08, abs=0.015)
+    assert float(found.lines["expert.landmarks.range_scale"]) == pytest.approx(1 / 1.08, abs=0.015)
 
 
 @pytest.mark.parametrize(
