@@ -206,6 +206,9 @@ def run(
     )
 
 
+_MOTIONLESS = 0.8  # share of a run without any motion source from which on it is none
+
+
 def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[Estimate]) -> Iterator[Finding]:
     """Findings of a run whose figures mean nothing: of one pose, or of positions that nothing measures."""
     if len(estimates) < 2:
@@ -217,6 +220,16 @@ def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[E
             "landmarks): its positions mean nothing, only its turn is measured. Record the robot's odometry too.",
             Severity.ERROR,
         )
+    elif not parts.sensors and {"image", "sightings"}.isdisjoint(roles):
+        whole_s = (estimates[-1].stamp_ns - estimates[0].stamp_ns) * 1e-9
+        if parts.wheels.unknown_s > _MOTIONLESS * whole_s:
+            yield Finding(
+                "motion.unmeasured",
+                f"For {parts.wheels.unknown_s:.1f} of {whole_s:.1f} s no motion of the wheels is known, and nothing "
+                "else measures how far the robot goes: its positions mean nothing. Look for why the messages were "
+                "refused: another unit, a geometry that is not filled in, or stamps of another clock.",
+                Severity.ERROR,
+            )
 
 
 def _contradiction(parts: Assembly) -> Contradiction | None:

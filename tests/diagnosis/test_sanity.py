@@ -330,6 +330,20 @@ def test_figures_that_mean_nothing_are_an_error(tmp_path, mode, asked, code):
     assert result.findings[0].severity is Severity.ERROR
 
 
+@pytest.mark.parametrize("mode", ["batch", "online"])
+def test_wheels_whose_messages_are_all_refused_measure_nothing(tmp_path, mode):
+    with BagWriter(tmp_path / "ticks") as writer:
+        for k in range(200):
+            stamp = 1_700_000_000_000_000_000 + k * 50_000_000
+            ticks = 5000.0 * k  # of a motor, not radians
+            writer.joints("/joint_states", stamp, ("left_wheel", "right_wheel"), (ticks, ticks), (1e5, 1e5))
+    wheels = {"left_joint": "left_wheel", "right_joint": "right_wheel", "left_radius": 0.05, "right_radius": 0.05}
+    config = Config.model_validate({"wheels": {"track": 0.3, "source": "ticks", **wheels}})
+    result = run(tmp_path / "ticks", None, config, mode)
+    assert result.findings[0].code == "motion.unmeasured"
+    assert exit_code(result) == EXIT_LOST
+
+
 @pytest.mark.parametrize("topics", [("imu", "sightings"), ("imu", "odometry")])
 def test_an_imu_beside_a_sensor_of_position_or_way_is_enough(tmp_path, topics):
     result = run(bag(tmp_path, n=100, topics=topics), None, Config(), "online")

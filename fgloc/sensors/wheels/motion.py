@@ -286,6 +286,11 @@ class WheelMotion:
         return tuple(notes)
 
     @property
+    def unknown_s(self) -> float:
+        """Time [s] for which no motion of the wheels was known so far."""
+        return self._unknown_s
+
+    @property
     def track_m(self) -> float | None:
         """Distance between the wheels [m], as configured; None: not known."""
         return self._config.track
