@@ -55,7 +55,9 @@ class Outcome:
         seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
         unused = unused_sightings(rejections, recording.roles, seen)
         known = {finding.code for finding in wrong.findings}
-        unread = unread_map(recording) if parts.landmark_map is not None and not recording.problems else None
+        unread = (
+            unread_map(recording, parts.config) if parts.landmark_map is not None and not recording.problems else None
+        )
         # All but images was compared before the run
         seen_in_images = parts.diagnosis.findings() if wrong.checked and parts.camera is not None else ()
         findings = [

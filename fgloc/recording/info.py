@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -378,7 +378,7 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
         found.append("No odometry, joint states or commands: nothing measures how the robot moves.")
-    if not unsettled and not roles.keys() - _NO_PLACE:
+    if not unsettled and not _placing(roles, config):
         found.append("No images and no marker sightings: nothing bounds the drift.")
     images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)
@@ -401,15 +401,16 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
     return found
 
 
-def unread_map(recording: Recording) -> str | None:
+def unread_map(recording: Recording, config: Config) -> str | None:
     """Sentence on a map that is given while nothing of the recording is read that sees landmarks; None: something is.
 
     Args:
         recording: whose roles and topics are known.
+        config: of the run.
     """
-    if recording.roles.keys() - _NO_PLACE:
+    if _placing(recording.roles, config):
         return None
-    unread = " ".join(_unused(recording))
+    unread = " ".join(_unused(recording, config))
     return (
         "A map is given, but the recording has no images and no sightings that are read: the run is dead reckoning, "
         f"and where on the map it takes place is not known.{' ' + unread if unread else ''} Run it without the map, or "
@@ -417,22 +418,29 @@ def unread_map(recording: Recording) -> str | None:
     )
 
 
-def _unused(recording: Recording, config: Config | None = None) -> list[str]:
+def _unused(recording: Recording, config: Config) -> list[str]:
     """Sentences on topics that hold the robot's position, and that nothing reads, or nothing as it is configured."""
-    unread = [
-        f"{t.name} ({t.message_type}) is not used: nothing here reads {_UNREAD[kind]}."
-        for t in recording.topics
-        if t.count and t.role is None and (kind := t.message_type.rpartition("/")[2]) in _UNREAD
-    ]
-    roles = set() if config is None else {sensor.name for sensor in outside_sensors()}
-    for topic in recording.topics:
-        if topic.count and topic.role in roles:
-            section = getattr(config, str(topic.role), None)
-            if section is None or section == type(section)():
-                unread.append(
-                    f"{topic.name} ({topic.message_type}) is not used: it needs the section {topic.role} of robot.yaml."
-                )
-    return unread
+    lacking, found = _lacking(config), []
+    for t in recording.topics:
+        kind = t.message_type.rpartition("/")[2]
+        if t.count and t.role in lacking:
+            found.append(f"{t.name} ({t.message_type}) is not used: give {lacking[t.role]} in robot.yaml.")
+        elif t.count and t.role is None and kind in _UNREAD:
+            found.append(f"{t.name} ({t.message_type}) is not used: nothing here reads {_UNREAD[kind]}.")
+    return found
+
+
+def _lacking(config: Config) -> dict[str, str]:
+    """Sensors that are not built because a setting of theirs is missing, with that setting."""
+    needed = {sensor.name: key for sensor in outside_sensors() if (key := getattr(sensor, "needs", ""))}
+    return {
+        name: f"{name}.{key}" for name, key in needed.items() if not getattr(getattr(config, name, None), key, None)
+    }
+
+
+def _placing(roles: Mapping[Role, str], config: Config) -> Collection[str]:
+    """Roles that tell where a robot is, of sensors that the configuration has."""
+    return roles.keys() - _NO_PLACE - _lacking(config).keys()
 
 
 def _mounting(recording: Recording, bases: tuple[str, ...], frame: str, camera: bool) -> list[str]:

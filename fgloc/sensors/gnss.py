@@ -180,6 +180,7 @@ class Gnss:
     """Positions of a GNSS receiver."""
 
     name: ClassVar[str] = "gnss"
+    needs: ClassVar[str] = "origin"  # the setting without which it is not built
     Config: ClassVar[type[Section]] = GnssConfig
     streams: ClassVar[tuple[Stream, ...]] = (
         Stream(

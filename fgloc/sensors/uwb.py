@@ -167,6 +167,7 @@ class Uwb:
     """Ultra-wideband ranges to anchors."""
 
     name: ClassVar[str] = "uwb"
+    needs: ClassVar[str] = "anchors"  # the setting without which it is not built
     Config: ClassVar[type[Section]] = UwbConfig
     streams: ClassVar[tuple[Stream, ...]] = (
         Stream("uwb", UwbEvent, {"sensor_msgs/msg/Range": from_range}, ("uwb", "uwb/range"), False, check),

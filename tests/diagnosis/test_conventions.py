@@ -258,5 +258,8 @@ def test_a_truth_that_freezes_and_topics_that_nothing_reads_are_named(tmp_path):
             more.range_reading("/ranges", stamp, 2.0, "radio")
     frozen = [f for f in inspect_all(bag, tmp_path / "map.yaml", Config()).found if f.code == "truth.frozen"]
     assert frozen[0].value == pytest.approx(0.4, abs=0.1)
-    unused = [f for f in inspect_all(tmp_path / "more", None, Config()).found if f.code == "recording.unused"]
+    found = inspect_all(tmp_path / "more", None, Config()).found
+    unused = [f for f in found if f.code == "recording.unused"]
     assert [f.severity for f in unused] == [Severity.NOTE]
+    assert "uwb.anchors" in unused[0].text
+    assert any("bounds the drift" in f.text for f in found)  # a sensor that is not built bounds nothing
