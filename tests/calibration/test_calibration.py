@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from fgloc import cli, se2
 from fgloc.calibrate import calibrate
 from fgloc.calibration.installation import found_text, given_text, setting_unit
-from fgloc.config import Config, load_config, model_path, yaml_of
+from fgloc.config import Config, config_of, load_config, model_path, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc.types import Setting
@@ -155,7 +155,7 @@ def test_a_written_configuration_is_read_back(tmp_path):
         "camera": {"file": tmp_path / "cameras" / "front.yaml"},
         "motion": {"model": model_path("shipped:mrclam/all")},
     }
-    config = Config.model_validate(values)
+    config = config_of(values)
     (tmp_path / "robot.yaml").write_text(yaml_of(config, tmp_path))
     text = (tmp_path / "robot.yaml").read_text()
     assert "shipped:mrclam/all" in text

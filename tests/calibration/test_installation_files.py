@@ -18,7 +18,7 @@ from fgloc.calibration.installation import (
     settings_found,
     with_settings,
 )
-from fgloc.config import Config, load_config, yaml_of
+from fgloc.config import Config, config_of, load_config, yaml_of
 from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.sensors.cameras import corrected
 from fgloc.sensors.maps import load_map
@@ -133,7 +133,9 @@ def test_all_clocks_against_the_gyros_accuse_the_gyros():
 
 
 def test_a_configuration_written_is_read(tmp_path):
-    config = with_settings(Config(), [Setting("gyro.scale", 1.0, 1.01, 0.001, 0.005), *map(_distortion, ("k1", "k2"))])
+    config = with_settings(
+        config_of({}), [Setting("gyro.scale", 1.0, 1.01, 0.001, 0.005), *map(_distortion, ("k1", "k2"))]
+    )
     path = tmp_path / "installation.yaml"
     path.write_text(yaml_of(config, tmp_path))
     assert load_config(path) == config
