@@ -175,6 +175,8 @@ class Replay:
         self._first_ns: int | None = None
         self._first_step_ns: int | None = None
         self.first_pose_s: float | None = None
+        # a sensor that is not built, as a setting of it is missing, tells no place
+        self._seeing = RawEvent | SightingsEvent | SensorEvent if parts.sensors else RawEvent | SightingsEvent
         self.no_landmark_sensor = True  # no image and no sighting was recorded, not even an unusable one
         self.activity = TopicActivity(recording.roles)
         self.clocks = TopicClocks()
@@ -243,9 +245,7 @@ class Replay:
                 time.sleep(max(0.0, elapsed / self._pace - (time.perf_counter() - began)))
             if self._progress is not None:
                 self._progress(elapsed, self._duration_s)
-            self.no_landmark_sensor = self.no_landmark_sensor and not isinstance(
-                event, RawEvent | SightingsEvent | SensorEvent
-            )
+            self.no_landmark_sensor = self.no_landmark_sensor and not isinstance(event, self._seeing)
             passed = self._parts.gate.check(event)
             if isinstance(passed, TruthEvent):
                 self.truth.add(passed)

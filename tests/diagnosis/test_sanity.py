@@ -10,7 +10,7 @@ import pytest
 
 from fgloc import se2
 from fgloc.cli.terminal import EXIT_LOST, exit_code
-from fgloc.config import Config
+from fgloc.config import Config, config_of
 from fgloc.diagnosis.sanity import Track, Watch, gyro_agrees, judged
 from fgloc.errors import FglocError
 from fgloc.estimation.localizer import Localizer
@@ -342,6 +342,19 @@ def test_wheels_whose_messages_are_all_refused_measure_nothing(tmp_path, mode):
     result = run(tmp_path / "ticks", None, config, mode)
     assert result.findings[0].code == "motion.unmeasured"
     assert exit_code(result) == EXIT_LOST
+
+
+def test_a_sensor_without_its_settings_leaves_a_run_on_a_map_its_odometry(tmp_path):
+    with BagWriter(tmp_path / "ranges") as writer:
+        for k in range(300):
+            stamp = 1_700_000_000_000_000_000 + k * 100_000_000
+            writer.odometry("/odom", stamp, (0.02 * k, 0.0, 0.0), (0.2, 0.0))
+            writer.range_reading("/ranges", stamp, 2.0, "anchor_1")
+    (tmp_path / "map.yaml").write_text("landmarks:\n- {id: 1, position: [0, 0, 0]}\n- {id: 2, position: [3, 0, 0]}\n")
+    result = run(tmp_path / "ranges", tmp_path / "map.yaml", config_of({}), "batch")
+    assert result.findings[0].code == "map.unused"
+    assert "uwb.anchors" in result.findings[0].text
+    assert np.hypot(*(result.trajectory.poses[-1] - result.trajectory.poses[0])[:2]) == pytest.approx(6.0, abs=0.2)
 
 
 @pytest.mark.parametrize("topics", [("imu", "sightings"), ("imu", "odometry")])
