@@ -222,7 +222,7 @@ def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[E
             "landmarks): its positions mean nothing, only its turn is measured. Record the robot's odometry too.",
             Severity.ERROR,
         )
-    elif not parts.sensors and {"image", "sightings"}.isdisjoint(roles):
+    elif not parts.sensors and parts.config.motion.model is None and {"image", "sightings"}.isdisjoint(roles):
         whole_s = (estimates[-1].stamp_ns - estimates[0].stamp_ns) * 1e-9
         if parts.wheels.unknown_s > _MOTIONLESS * whole_s:
             yield Finding(

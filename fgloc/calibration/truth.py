@@ -211,7 +211,7 @@ class _Fit:
         )
 
     def settings(self) -> tuple[Setting, ...]:
-        """What was found, beside what was given."""
+        """Rows of the table of `fgloc calibrate`: each setting as it was given and as it was found."""
         n = len(self._names)
         prior = np.diag(self._prior[:n] ** 2)
         state = InstallationState(

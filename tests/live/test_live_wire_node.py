@@ -393,6 +393,14 @@ def test_a_given_pose_of_any_content_is_refused_and_counted(x, variance, norm, c
         assert session.node.refused["/initialpose"] == 1
 
 
+def test_a_given_pose_without_one_coordinate_is_refused():
+    with Session(Config()) as session, Participant(DOMAIN) as one:
+        pose = {"position": {"x": 1.0, "y": float("nan")}, "orientation": {"w": 1.0}}
+        cdr = one.messages.encode(POSE, {"header": {"frame_id": "map"}, "pose": {"pose": pose}})
+        session.node._on_initial_pose(Sample("/initialpose", POSE, cdr, 0))
+        assert session.node.refused["/initialpose"] == 1
+
+
 def test_text_that_is_no_text_in_a_given_pose_is_refused():
     with Session(Config()) as session, Participant(DOMAIN) as one:
         message = {"header": {"frame_id": "map"}, "pose": {"pose": {"orientation": {"w": 1.0}}}}

@@ -325,7 +325,7 @@ class Node:
             variances = np.square(self._config.estimator.initial_sigmas)
         pose = (given.pose.position.x, given.pose.position.y, quaternion_yaw((q.x, q.y, q.z, q.w)))
         farthest, widest = self._config.gate.max_position, self._config.gate.max_variance
-        if not max(abs(pose[0]), abs(pose[1])) <= farthest:
+        if not np.abs(pose).max() <= farthest:  # nor with a NaN in it
             raise ValueError(f"position {pose[0]:g}, {pose[1]:g} m, expected within {farthest:g} m")
         if not variances.max() <= widest:
             raise ValueError(f"a variance of {variances.max():g}, expected at most {widest:g}")
