@@ -37,6 +37,33 @@ _DEFINITIONS = {
     "apriltag_msgs/msg/AprilTagDetectionArray": (
         "std_msgs/Header header\napriltag_msgs/AprilTagDetection[] detections\n"
     ),
+    "apriltag_msgs/msg/Apriltag": (
+        "int32 id\nstring family\nint32 hamming\nint32 border\nint32 bits\n"
+        "geometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n"
+    ),
+    "apriltag_msgs/msg/ApriltagArrayStamped": "std_msgs/Header header\napriltag_msgs/Apriltag[] apriltags\n",
+    "fiducial_msgs/msg/Fiducial": (
+        "int32 fiducial_id\nint32 direction\n"
+        "float64 x0\nfloat64 y0\nfloat64 x1\nfloat64 y1\nfloat64 x2\nfloat64 y2\nfloat64 x3\nfloat64 y3\n"
+    ),
+    "fiducial_msgs/msg/FiducialArray": (
+        "std_msgs/Header header\nint32 image_seq\nfiducial_msgs/Fiducial[] fiducials\n"
+    ),
+    "fiducial_msgs/msg/FiducialTransform": (
+        "int32 fiducial_id\ngeometry_msgs/Transform transform\n"
+        "float64 image_error\nfloat64 object_error\nfloat64 fiducial_area\n"
+    ),
+    "fiducial_msgs/msg/FiducialTransformArray": (
+        "std_msgs/Header header\nint32 image_seq\nfiducial_msgs/FiducialTransform[] transforms\n"
+    ),
+    "aruco_opencv_msgs/msg/MarkerPose": "uint16 marker_id\ngeometry_msgs/Pose pose\n",
+    "aruco_opencv_msgs/msg/BoardPose": "string board_name\ngeometry_msgs/Pose pose\n",
+    "aruco_opencv_msgs/msg/ArucoDetection": (
+        "std_msgs/Header header\naruco_opencv_msgs/MarkerPose[] markers\naruco_opencv_msgs/BoardPose[] boards\n"
+    ),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": (
+        "std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses\n"
+    ),
     "aruco_msgs/msg/Marker": (
         "std_msgs/Header header\nuint32 id\ngeometry_msgs/PoseWithCovariance pose\nfloat64 confidence\n"
     ),

@@ -46,7 +46,7 @@ class MarkerPose(Sighting):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerPosesEvent(SightingsEvent):
-    """``aruco_msgs/MarkerArray`` or ``vision_msgs/Detection3DArray``."""
+    """Poses of the markers in one image, in the axes of the sensor."""
 
     sightings: tuple[MarkerPose, ...]
 
@@ -70,6 +70,35 @@ def from_detections(m: Any, when: When) -> Event:
     if named and not sightings:
         raise ValueError("no detection's id holds a number")
     return MarkerPosesEvent(*when, m.header.frame_id, sightings)
+
+
+def from_aruco_opencv(m: Any, when: When) -> Event:
+    """Event of a ``aruco_opencv_msgs/ArucoDetection``; the boards in it have no number, and are left out."""
+    return MarkerPosesEvent(*when, m.header.frame_id, tuple(_bare_pose(int(s.marker_id), s.pose) for s in m.markers))
+
+
+def from_ros2_aruco(m: Any, when: When) -> Event:
+    """Event of a ``ros2_aruco_interfaces/ArucoMarkers``.
+
+    Raises:
+        ValueError: it has not as many poses as ids.
+    """
+    seen = tuple(_bare_pose(int(i), pose) for i, pose in zip(m.marker_ids, m.poses, strict=True))
+    return MarkerPosesEvent(*when, m.header.frame_id, seen)
+
+
+def from_fiducial_transforms(m: Any, when: When) -> Event:
+    """Event of a ``fiducial_msgs/FiducialTransformArray``."""
+    seen = (
+        MarkerPose(int(t.fiducial_id), xyz(t.transform.translation), xyzw(t.transform.rotation), np.zeros((6, 6)))
+        for t in m.transforms
+    )
+    return MarkerPosesEvent(*when, m.header.frame_id, tuple(seen))
+
+
+def _bare_pose(marker_id: int, pose: Any) -> MarkerPose:
+    """Marker pose of a ``geometry_msgs/Pose``, which has no covariance."""
+    return MarkerPose(marker_id, xyz(pose.position), xyzw(pose.orientation), np.zeros((6, 6)))
 
 
 def _marker_pose(marker_id: int, pose: Any) -> MarkerPose:
@@ -150,6 +179,9 @@ MARKER_POSE = BuiltIn(
             MarkerPosesEvent,
             {
                 "aruco_msgs/msg/MarkerArray": from_aruco,
+                "aruco_opencv_msgs/msg/ArucoDetection": from_aruco_opencv,
+                "fiducial_msgs/msg/FiducialTransformArray": from_fiducial_transforms,
+                "ros2_aruco_interfaces/msg/ArucoMarkers": from_ros2_aruco,
                 "vision_msgs/msg/Detection3DArray": from_detections,
             },
             (),

@@ -178,6 +178,89 @@ def test_aruco_poses(tmp_path):
     assert [(s.landmark_id, s.position[0]) for s in event.sightings] == [(0, 0.0), (7, 7.0)]
 
 
+SQUARE = [[100.0, 100.0], [200.0, 100.0], [200.0, 200.0], [100.0, 200.0]]  # clockwise from the top left
+
+
+def fiducials(bag, header):
+    vertices = {f"{axis}{i}": xy[k] for i, xy in enumerate(SQUARE) for k, axis in enumerate("xy")}
+    seen = [bag.make("fiducial_msgs/msg/Fiducial", fiducial_id=7, direction=0, **vertices)]
+    return bag.make("fiducial_msgs/msg/FiducialArray", header=header, image_seq=0, fiducials=seen)
+
+
+def tagslam_corners(bag, header):
+    def point(x: float, y: float):
+        return bag.make("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
+
+    corners = [point(*SQUARE[i]) for i in (3, 2, 1, 0)]  # from the bottom left, counter-clockwise
+    tag = dict(id=7, family="36h11", hamming=0, border=1, bits=6, center=point(150.0, 150.0), corners=corners)
+    tags = [bag.make("apriltag_msgs/msg/Apriltag", **tag)]
+    return bag.make("apriltag_msgs/msg/ApriltagArrayStamped", header=header, apriltags=tags)
+
+
+@pytest.mark.parametrize(
+    ("kind", "make"),
+    [
+        ("fiducial_msgs/msg/FiducialArray", fiducials),
+        ("apriltag_msgs/msg/ApriltagArrayStamped", tagslam_corners),
+    ],
+)
+def test_corners_of_other_detectors_are_put_in_opencv_order(tmp_path, kind, make):
+    (event,) = read(write_sightings(tmp_path / "run", kind, make))
+    assert isinstance(event, CornersEvent)
+    (tag,) = event.sightings
+    assert tag.landmark_id == 7
+    np.testing.assert_array_equal(tag.corners_px, SQUARE)
+
+
+def aruco_opencv(bag, header):
+    marker = bag.make("aruco_opencv_msgs/msg/MarkerPose", marker_id=7, pose=make_pose(bag, 2.0).pose)
+    return bag.make("aruco_opencv_msgs/msg/ArucoDetection", header=header, markers=[marker], boards=[])
+
+
+def ros2_aruco(bag, header):
+    ids = np.array([7], dtype=np.int64)
+    poses = [make_pose(bag, 2.0).pose]
+    return bag.make("ros2_aruco_interfaces/msg/ArucoMarkers", header=header, marker_ids=ids, poses=poses)
+
+
+def fiducial_transforms(bag, header):
+    pose = make_pose(bag, 2.0).pose
+    moved = bag.make("geometry_msgs/msg/Vector3", x=2.0, y=0.0, z=0.0)
+    transform = bag.make("geometry_msgs/msg/Transform", translation=moved, rotation=pose.orientation)
+    values = dict(fiducial_id=7, transform=transform, image_error=0.1, object_error=0.01, fiducial_area=900.0)
+    seen = [bag.make("fiducial_msgs/msg/FiducialTransform", **values)]
+    return bag.make("fiducial_msgs/msg/FiducialTransformArray", header=header, image_seq=0, transforms=seen)
+
+
+@pytest.mark.parametrize(
+    ("kind", "make"),
+    [
+        ("aruco_opencv_msgs/msg/ArucoDetection", aruco_opencv),
+        ("ros2_aruco_interfaces/msg/ArucoMarkers", ros2_aruco),
+        ("fiducial_msgs/msg/FiducialTransformArray", fiducial_transforms),
+    ],
+)
+def test_poses_of_other_detectors(tmp_path, kind, make):
+    (event,) = read(write_sightings(tmp_path / "run", kind, make))
+    assert isinstance(event, MarkerPosesEvent)
+    (seen,) = event.sightings
+    assert (seen.landmark_id, *seen.position, *seen.orientation) == (7, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    assert not seen.cov.any()
+
+
+def test_of_ids_and_poses_that_differ_in_number_nothing_is_used(tmp_path):
+    def make(bag, header):
+        ids = np.array([7, 8], dtype=np.int64)
+        poses = [make_pose(bag, 2.0).pose]
+        return bag.make("ros2_aruco_interfaces/msg/ArucoMarkers", header=header, marker_ids=ids, poses=poses)
+
+    with open_recording(
+        write_sightings(tmp_path / "run", "ros2_aruco_interfaces/msg/ArucoMarkers", make), DEFAULT
+    ) as r:
+        assert list(r.events()) == []
+        assert r.undecodable == {"/seen": 1}
+
+
 @pytest.mark.parametrize(
     ("class_id", "own_id", "expected"),
     [("7", "", 7), ("tag36h11:7", "", 7), ("marker_7", "3", 7), ("tag36h11", "12", 12), ("0", "", 0)],

@@ -62,7 +62,7 @@ class MarkerCorners(Sighting):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CornersEvent(SightingsEvent):
-    """Markers found in one image: ``apriltag_msgs/AprilTagDetectionArray``, or our detector on an ImageEvent."""
+    """Markers found in one image, by another node's detector or by our own on an ImageEvent."""
 
     in_pixels: ClassVar[bool] = True
 

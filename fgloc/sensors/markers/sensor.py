@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 _OPENCV_ORDER = (1, 0, 3, 2)
 _OPENCV_SHIFT_PX = -0.5
+_TAGSLAM_ORDER = (3, 2, 1, 0)  # it begins at the bottom left and goes on to the right
 
 
 def from_image(m: Any, when: When) -> Event:
@@ -60,6 +61,29 @@ def from_apriltags(m: Any, when: When) -> Event:
         corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_OPENCV_ORDER)] + _OPENCV_SHIFT_PX
         sightings.append(MarkerCorners(int(tag.id), corners))
     return CornersEvent(*when, m.header.frame_id, tuple(sightings))
+
+
+def from_tagslam(m: Any, when: When) -> Event:
+    """Event of a ``apriltag_msgs/ApriltagArrayStamped``, as TagSLAM's detector nodes publish it."""
+    sightings = []
+    for tag in m.apriltags:
+        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_TAGSLAM_ORDER)]
+        sightings.append(MarkerCorners(int(tag.id), corners))
+    return CornersEvent(*when, m.header.frame_id, tuple(sightings))
+
+
+def from_fiducials(m: Any, when: When) -> Event:
+    """Event of a ``fiducial_msgs/FiducialArray``, whose vertices are in OpenCV's order and pixels."""
+    return CornersEvent(
+        *when,
+        m.header.frame_id,
+        tuple(
+            MarkerCorners(
+                int(f.fiducial_id), np.array([(f.x0, f.y0), (f.x1, f.y1), (f.x2, f.y2), (f.x3, f.y3)], dtype=float)
+            )
+            for f in m.fiducials
+        ),
+    )
 
 
 _MAX_PIXEL = 1e5
@@ -345,8 +369,12 @@ MARKERS = BuiltIn(
         Stream(
             "sightings",
             CornersEvent,
-            {"apriltag_msgs/msg/AprilTagDetectionArray": from_apriltags},
-            (),
+            {
+                "apriltag_msgs/msg/AprilTagDetectionArray": from_apriltags,
+                "apriltag_msgs/msg/ApriltagArrayStamped": from_tagslam,
+                "fiducial_msgs/msg/FiducialArray": from_fiducials,
+            },
+            ("fiducial_vertices",),
             keyframe=True,
             validator=corners_validator,
             findings=SightingsChecks,
