@@ -105,7 +105,7 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     watched_gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
     attitude = None if setup.T_base_imu is None else Attitude(config.gyro, setup.T_base_imu)
     flat = config.estimator.ground == "flat"
-    motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude, alone=not setup.sees)
+    motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude, not setup.sees, setup.beside)
     landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
     seen = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)  # what it refuses does not count
     floor = FloorWatch(attitude, wheels, seen, landmark_map) if flat else None

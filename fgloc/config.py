@@ -294,6 +294,15 @@ class MotionConfig(Section):
 
 MOTION_SOURCES = ("wheels", "learned", "gyro")
 """Names of the motion sources: of their measurements, in ``steps.csv``, of their parameters of the installation."""
+BESIDE = "odometry."
+"""Begins the name of an odometry beside the wheels, which is its role and its source: ``odometry.visual``."""
+ODOMETRIES = "odometries"
+"""Role of streams of such odometries of any name, under which their messages are counted."""
+
+
+def is_motion_source(name: str) -> bool:
+    """Whether a motion source has this name: one of `MOTION_SOURCES`, or an odometry beside them."""
+    return name in MOTION_SOURCES or name.startswith(BESIDE)
 
 
 class SensorSections(Section):
@@ -319,19 +328,19 @@ BUILT_IN_ROLES = ("odometry", "command", "joints", "imu", "image", "camera_info"
 
 def role_names() -> tuple[Role, ...]:
     """All roles, the built-in ones first."""
-    outside = (stream.role for sensor in outside_sensors() for stream in sensor.streams)
+    outside = (stream.role for sensor in outside_sensors() for stream in sensor.streams if stream.role != ODOMETRIES)
     return tuple(dict.fromkeys((*BUILT_IN_ROLES, *outside)))  # one may read a built-in role from a message of its own
 
 
 def _known_role(role: str) -> str:
-    if role not in role_names():
-        raise ValueError(f"expected one of {', '.join(role_names())}")
+    if role not in role_names() and not role.startswith(BESIDE):
+        raise ValueError(f"expected one of {', '.join(role_names())}, or {BESIDE}NAME of recording.odometries")
     return role
 
 
 def _known_source(name: str) -> str:
-    if name not in MOTION_SOURCES:
-        raise ValueError(f"expected one of {', '.join(MOTION_SOURCES)}")
+    if not is_motion_source(name):
+        raise ValueError(f"expected one of {', '.join(MOTION_SOURCES)}, or {BESIDE}NAME of recording.odometries")
     return name
 
 
@@ -355,10 +364,30 @@ class TopicsConfig(Section):
         return getattr(self, role, None)
 
 
+class OdometryTopic(Section):
+    """One odometry beside the wheels."""
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$", description="in reports: visual, lidar, rear_wheels")
+    topic: str = Field(min_length=1, description="of nav_msgs/Odometry")
+    pose: tuple[_Place, _Place, _Place] | None = Field(
+        None, description="of what it tracks, in the base frame: x y [m] yaw [rad]; None: by tf, else the base"
+    )
+
+    @property
+    def role(self) -> Role:
+        """Role of its topic and name of the motion source."""
+        return BESIDE + self.name
+
+
 class RecordingConfig(Section):
     """How to read a recording."""
 
     topics: TopicsConfig = TopicsConfig()
+    odometries: tuple[OdometryTopic, ...] = Field(
+        (),
+        max_length=8,
+        description="odometries beside the wheels: name and topic of each, and its pose (docs/odometries.md)",
+    )
     received_stamps: tuple[_KnownRole, ...] = Field(
         (), description="roles whose header stamps are wrong: use receive times"
     )
@@ -384,6 +413,19 @@ class RecordingConfig(Section):
     imu_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
         None, description="IMU in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
     )
+
+    @model_validator(mode="after")
+    def _distinct(self) -> RecordingConfig:
+        for what in ("name", "topic"):
+            given = [getattr(one, what) for one in self.odometries]
+            if len(set(given)) < len(given):
+                raise ValueError(f"odometries have the {what}s {', '.join(given)}, expected each once")
+        return self
+
+    @property
+    def beside(self) -> dict[Role, str]:
+        """Topics of the odometries beside the wheels, by role."""
+        return {one.role: one.topic for one in self.odometries}
 
 
 class GateConfig(Section):
@@ -588,7 +630,9 @@ def _with_sensors(sensors: tuple[type[Any], ...]) -> type[Config]:
     for sensor in sensors:
         if sensor.name in Config.model_fields:
             raise ConfigError(f"sensor '{sensor.name}': {sensor.name} is a key of robot.yaml already; rename it")
-    roles: dict[str, Any] = {s.role: (str | None, None) for sensor in sensors for s in sensor.streams}
+    roles: dict[str, Any] = {
+        s.role: (str | None, None) for sensor in sensors for s in sensor.streams if s.role != ODOMETRIES
+    }
     topics = create_model("TopicsConfig", __base__=TopicsConfig, __doc__=TopicsConfig.__doc__, **roles)
     recording = create_model(
         "RecordingConfig", __base__=RecordingConfig, __doc__=RecordingConfig.__doc__, topics=(topics, topics())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +21,7 @@ from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, resc
 from fgloc.sensors.learned.sensor import LearnedMotion, learned_motion
 from fgloc.sensors.maps import configured_map
 from fgloc.sensors.markers.detector import MarkerDetector, configured_detector
+from fgloc.sensors.odometry import BesideOdometry
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -165,6 +166,7 @@ class SensorSetup:
         sensors: those of other packages.
         notes: what the user should know.
         sees: whether anything in the stream can tell where the robot is.
+        beside: odometries beside the wheels.
     """
 
     config: Config
@@ -178,6 +180,7 @@ class SensorSetup:
     sensors: tuple[Sensor, ...]
     notes: tuple[str, ...]
     sees: bool
+    beside: tuple[BesideOdometry, ...] = ()
 
 
 def recorded_setup(
@@ -233,8 +236,21 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
         imu_up = mounted_up(facts, config, facts.first)
         T_base_imu = mounted_imu(facts, config, facts.first)
     sees = bool(sensors) or not {"image", "sightings"}.isdisjoint(facts.roles)
+    there = [one for one in config.recording.odometries if one.role in facts.roles]
+    beside = tuple(BesideOdometry(one, config.gate, _frames(facts, config)) for one in there)
     return SensorSetup(
-        config, landmark_map, detector, camera, T_base_sensor, learned, imu_up, T_base_imu, sensors, tuple(notes), sees
+        config,
+        landmark_map,
+        detector,
+        camera,
+        T_base_sensor,
+        learned,
+        imu_up,
+        T_base_imu,
+        sensors,
+        tuple(notes),
+        sees,
+        beside,
     )
 
 
@@ -261,6 +277,16 @@ def _need_motion(facts: StreamFacts) -> None:
 
 def _sensors(facts: StreamFacts, config: Config, landmark_map: LandmarkMap | None) -> tuple[Sensor, ...]:
     """Those registered sensors that have settings and a topic in this stream."""
+    contexts = {
+        sensor.name: Context(config, getattr(config, sensor.name), facts.roles, landmark_map, _frames(facts, config))
+        for sensor in registry.sensors()
+        if hasattr(config, sensor.name) and any(stream.role in facts.roles for stream in sensor.streams)
+    }
+    return registry.build(contexts)
+
+
+def _frames(facts: StreamFacts, config: Config) -> Callable[[str], FloatArray | None]:
+    """Function from the name of a frame to ``T_base_frame (4, 4)``; None: tf has no such frame."""
 
     def frame(name: str) -> FloatArray | None:
         base = base_frame(facts, config, facts.first)
@@ -268,12 +294,7 @@ def _sensors(facts: StreamFacts, config: Config, landmark_map: LandmarkMap | Non
             return np.eye(4)
         return facts.frames.lookup(base, name) if name in facts.frames and base in facts.frames else None
 
-    contexts = {
-        sensor.name: Context(config, getattr(config, sensor.name), facts.roles, landmark_map, frame)
-        for sensor in registry.sensors()
-        if hasattr(config, sensor.name) and any(stream.role in facts.roles for stream in sensor.streams)
-    }
-    return registry.build(contexts)
+    return frame
 
 
 def _no_landmarks(facts: StreamFacts, sensors: Sequence[Sensor]) -> LandmarkMap:

@@ -335,6 +335,7 @@ class MotionReadings:
     gyro: MotionMeasurement | None = None  # only its yaw means anything
     inertial: InertialReading | None = None  # on uneven ground
     at_rest: bool = False  # wheels report no motion, and the gyro none but its bias
+    beside: tuple[MotionMeasurement, ...] = ()  # odometries beside the wheels
 
 
 # --- Findings: errors, warnings and notes on a recording, its set-up or a run -----------------------------------------

@@ -190,7 +190,7 @@ class FaultAttribution:
         self._fits: dict[int, Fit | None] = {}
 
     def contradicted(self, steps: int | None) -> Contradicted | None:
-        """Which of wheels and learned motion sightings contradict over the newest keyframes.
+        """Which of wheels, learned motion and odometries beside them sightings contradict over the newest keyframes.
 
         Args:
             steps: for how many the sources differ, the last of them is not in the log yet; None: over a whole window.
@@ -209,8 +209,9 @@ class FaultAttribution:
         cov = se2.compose_cov(first.cov, went, last.cov)
         bound = chi2_bound(self._config.estimator.gate_probability, se2.DOF)
         wrong = set()
-        for name, factor in (("wheels", 1.0), ("learned", COVARIANCE_FACTOR)):
-            motions = [r.wheels if name == "wheels" else r.learned for r in (f.readings for f in frames[1:])]
+        beside = {m.source: 1.0 for frame in frames[1:] for m in frame.readings.beside}
+        for name, factor in {"wheels": 1.0, "learned": COVARIANCE_FACTOR, **beside}.items():
+            motions = [_of(f.readings, name) for f in frames[1:]]
             known = [replace(m, cov=factor * m.cov) for m in motions if m is not None]
             if len(known) == len(motions) and self._nis(known, went, cov) > bound:
                 wrong.add(name)
@@ -260,6 +261,11 @@ class FaultAttribution:
         cov_total = cov_total + cov + D @ factors.estimated.cov[np.ix_(rows, rows)] @ D.T
         miss = se2.log(se2.between(total, went))
         return float(miss @ np.linalg.solve(cov_total, miss))
+
+
+def _of(readings: MotionReadings, name: str) -> MotionMeasurement | None:
+    """Motion of a source by its name; None: it has none."""
+    return next((m for m in (readings.wheels, readings.learned, *readings.beside) if m and m.source == name), None)
 
 
 # --- A bias that lasts ------------------------------------------------------------------------------------------------

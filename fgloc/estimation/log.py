@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from fgloc import se2
+from fgloc.config import BESIDE
 from fgloc.estimation.faults import FaultVerdict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
@@ -22,6 +23,12 @@ _REASONS = {
     "frozen": "they stood still while the robot moved",
     "left_wheel_dead": "the left wheel's encoder stood still",
     "right_wheel_dead": "the right wheel's encoder stood still",
+}
+_OF_BESIDE = {
+    "frozen": "it stood still while the robot moved",
+    "jumped": "its pose jumped",
+    "restarted": "it began again at its origin",
+    "deviates": "it went elsewhere",
 }
 
 
@@ -40,7 +47,7 @@ def motion_decisions(
     overruled = "" if budget.overruled_cov is None else OVERRULED
     used = {m.source: m for m in motions}
     unknown = [m for m in motions if m.source == "unknown"]
-    for reading in (readings.wheels, readings.learned, readings.gyro, *unknown):
+    for reading in (readings.wheels, readings.learned, readings.gyro, *readings.beside, *unknown):
         source = "" if reading is None else reading.source
         why = budget.rejected.get(source, overruled)
         if reading is None or (source not in used and not why):
@@ -100,5 +107,7 @@ def moved_notes(displacements: Mapping[int, FloatArray]) -> Iterator[str]:
 def flag_notes(flags: Mapping[str, int]) -> Iterator[str]:
     """Sentence for each source that was flagged, with the number of flags; keys are "source.reason"."""
     for kind, n in sorted(flags.items()):
-        source, reason = kind.split(".")
-        yield f"the {registry.title_of(source)} disagreed with the other motion sources {n} time(s): {_REASONS[reason]}"
+        source, _, reason = kind.rpartition(".")
+        beside = source.startswith(BESIDE)
+        name, why = (source, _OF_BESIDE[reason]) if beside else (f"the {registry.title_of(source)}", _REASONS[reason])
+        yield f"{name} disagreed with the other motion sources {n} time(s): {why}"

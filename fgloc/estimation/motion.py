@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config, WeightsConfig
+from fgloc.config import MOTION_SOURCES, Config, WeightsConfig
+from fgloc.estimation.beside import OdometriesBeside
 from fgloc.estimation.faults import Contradicted, FaultAttribution, FaultVerdict, GlrResult, GlrTest, LiftMonitor
 from fgloc.estimation.log import flag_notes, motion_decisions
 from fgloc.graph.estimators import Estimator
@@ -121,6 +122,7 @@ class MotionSources:
         self._known_rest = 10.0 * config.wheels.noise.xy_per_sqrt_s**2
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro, self.attitude = sensors.gyro, sensors.attitude
+        self.beside: OdometriesBeside | None = None  # set by the judge, which compares them
         self._alone = TurnComparison(config) if sensors.alone and sensors.gyro is not None else None
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
         self._yaw_indirect_s = 0.0  # how far back the yaw rests on the gyro, where fixes observe it along the way only
@@ -179,8 +181,9 @@ class MotionSources:
                     wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
         learned = self._with_drift(self._measure_learned(step))
         inertial = None if self.attitude is None else self.attitude.measure(step, self._wheels.twist)
-        readings = MotionReadings(wheels, learned, gyro, inertial, self._at_rest(step, reported))
-        if readings.wheels is not None or readings.learned is not None:
+        beside = () if self.beside is None else self.beside.read(step)
+        readings = MotionReadings(wheels, learned, gyro, inertial, self._at_rest(step, reported), beside)
+        if readings.wheels is not None or readings.learned is not None or readings.beside:
             self._silent_s = 0.0
         return readings
 
@@ -306,6 +309,8 @@ class MotionSources:
     def begin_segment(self) -> None:
         """Forget the last fix, as nothing is known of the motion during a jump of the clock."""
         self._silent_s = self._yaw_indirect_s = 0.0
+        if self.beside is not None:
+            self.beside.begin_segment()
         if self.gyro is not None:
             self.gyro.forget_fix()
 
@@ -543,10 +548,11 @@ class MotionFaultMonitor:
         return abs(forward - turn), abs(forward + turn)
 
 
-def _without(readings: MotionReadings, sources: Iterable[str]) -> MotionReadings:
+def _without(readings: MotionReadings, sources: Collection[str]) -> MotionReadings:
     """Readings without those of these sources."""
-    gone: dict[str, Any] = dict.fromkeys(sources)
-    return replace(readings, **gone)
+    gone: dict[str, Any] = dict.fromkeys(name for name in sources if name in MOTION_SOURCES)
+    beside = tuple(m for m in readings.beside if m.source not in sources)
+    return replace(readings, **gone, beside=beside)
 
 
 # --- Judge, and revise past steps -------------------------------------------------------------------------------------
@@ -595,8 +601,11 @@ class MotionJudge:
         self.sources = MotionSources(config, sensors, estimator.factors)
         self.rejections: Counter[str] = Counter()
         self._estimator = estimator
-        attribution = FaultAttribution(config, estimator) if self.sources.learned_is_independent else None
+        by_sightings = FaultAttribution(config, estimator)
+        attribution = by_sightings if self.sources.learned_is_independent else None
         self._faults = MotionFaultMonitor(config.weights, self.sources, sensors.wheels.track_m, attribution)
+        if sensors.beside:
+            self.sources.beside = OdometriesBeside(config.weights, sensors.beside, estimator.factors, by_sightings)
         self._lift = LiftMonitor(config.estimator.lag_s, None if sensors.gyro is None else sensors.gyro.up)
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
@@ -640,12 +649,39 @@ class MotionJudge:
         """Test the sources against each other, back to where they began to differ, and combine what is left of them."""
         verdict = self._faults.judge(step, readings)
         revisions = self._revise(verdict)
+        if self.sources.beside is not None:
+            verdict, left_out = self._judge_beside(step, readings, verdict)
+            revisions = (*revisions, *left_out)
         factors = tuple(self.combine(step, readings, verdict.budget))
         if self._lift.carried:
             return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)
         if factors[0].source == "unknown":
             self.rejections["motion.silent"] += 1
         return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
+
+    def _judge_beside(
+        self, step: Step, readings: MotionReadings, verdict: FaultVerdict
+    ) -> tuple[FaultVerdict, tuple[Decision, ...]]:
+        """Verdict with the odometries beside the wheels that are wrong left out, and rows of the steps before."""
+        assert self.sources.beside is not None
+        others = verdict.budget.combine(replace(readings, beside=(), at_rest=False), self.sources.rules)
+        found = self.sources.beside.judge(step, others)
+        if not found.rejected:
+            return verdict, ()
+        newest, span = self._estimator.k, found.span
+        changed: dict[int, Sequence[MotionMeasurement]] = {}
+        rows: list[Decision] = []
+        log = self._estimator.log.keyframes
+        for frame in (log[i] for i in range(newest - span + 2, newest + 1) if i in log):
+            if frame.prior is not None or found.rejected.keys() <= frame.budget.rejected.keys():
+                continue
+            frame.budget = replace(frame.budget, rejected={**found.rejected, **frame.budget.rejected})
+            if motions := frame.budget.combine(frame.readings, self.sources.rules):
+                changed[frame.k] = motions
+                rows += motion_decisions(frame.k, motions, frame.readings, frame.budget, verdict)
+        self._estimator.revise(changed)
+        budget = replace(verdict.budget, rejected={**found.rejected, **verdict.budget.rejected})
+        return replace(verdict, budget=budget), tuple(rows)
 
     def commit(self, motion: JudgedMotion, fix: PoseWithCovariance | None, observes_yaw: bool) -> None:
         """Update bias and drift of the sources after a step, see `MotionSources.commit`."""
@@ -670,7 +706,9 @@ class MotionJudge:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user about the motion sources."""
-        return (*self._model_notes(), *flag_notes(self._faults.flags))
+        beside = self.sources.beside
+        flags, notes = (Counter[str](), ()) if beside is None else (beside.flags, beside.notes)
+        return (*self._model_notes(), *flag_notes(self._faults.flags + flags), *notes)
 
     @property
     def mistakes(self) -> tuple[str, ...]:
@@ -712,7 +750,12 @@ def _revised(frame: Keyframe, now: NoiseBudget) -> NoiseBudget | None:
     """The budget of an earlier step by what is known now; None: it stays."""
     before = frame.budget
     if now.rejected:
-        known = {name: why for name, why in before.rejected.items() if why in (KNOWN, _CARRIED)}
+        known = {
+            name: why
+            for name, why in before.rejected.items()
+            if why in (KNOWN, _CARRIED)
+            or name not in MOTION_SOURCES  # those beside the wheels have a judge of their own
+        }
         if {**now.rejected, **known}.keys() == before.rejected.keys():
             return None
         return replace(before, rejected={**now.rejected, **known})

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from fgloc.calibration.installation import contradicted
-from fgloc.config import MOTION_SOURCES
+from fgloc.config import is_motion_source
 from fgloc.results import RunData
 from fgloc.stats import SURE_SIGMAS
 from fgloc.types import Decision, IntArray, Trajectory
@@ -253,11 +253,11 @@ def _episodes(decisions: Sequence[Decision], trajectory: Trajectory) -> list[tup
 
 def _grouped(decisions: Sequence[Decision]) -> dict[tuple[Kind, str], list[Decision]]:
     """Rows of ``steps.csv`` by kind and subject of their judgement."""
-    last = {(d.step, d.kind): i for i, d in enumerate(decisions) if d.kind in MOTION_SOURCES}
+    last = {(d.step, d.kind): i for i, d in enumerate(decisions) if is_motion_source(d.kind)}
     moved = {d.landmark_id for d in decisions if d.reason in ("quarantined", "landmark_moved")}
     grouped: dict[tuple[Kind, str], list[Decision]] = defaultdict(list)
     for i, d in enumerate(decisions):
-        if d.kind in MOTION_SOURCES and last[d.step, d.kind] != i:
+        if is_motion_source(d.kind) and last[d.step, d.kind] != i:
             continue  # judged again further down
         if (named := _named(d, moved)) is not None:
             grouped[named].append(d)
@@ -270,7 +270,7 @@ def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
     """Kind and subject of a row's judgement; None: nothing is wrong, or another row has that judgement."""
     if not d.reason:
         return None
-    if d.kind in MOTION_SOURCES:
+    if is_motion_source(d.kind):
         return None if d.reason in _OF_PLACES else ("motion_faulty", d.kind)
     if d.kind == "mode":
         return _OF_MODES[d.reason], "pose"

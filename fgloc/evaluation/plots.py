@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 from mpl_toolkits.mplot3d import Axes3D
 
-from fgloc.config import MOTION_SOURCES
+from fgloc.config import MOTION_SOURCES, is_motion_source
 from fgloc.evaluation.metrics import Matched
 from fgloc.evaluation.style import (
     BLUE,
@@ -316,8 +316,7 @@ def plot_error(result: RunData, matched: Matched | None) -> Figure:
 
 # --- Timeline: messages received, weights of the sources, fit of the sightings, flags, errors -------------------------
 
-_SOURCES = (*MOTION_SOURCES, "unknown")
-_NOT_SEEN = (*_SOURCES, "place", "prior", "mode", "clock")
+_NOT_SEEN = ("unknown", "place", "prior", "mode", "clock")
 _MAX_FLAGS = 12
 _MAX_LANDMARKS = 20
 _ROW_IN = 0.18  # inches
@@ -344,8 +343,8 @@ def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: Int
         matched: estimate and truth, for the errors.
         slips_ns: ``(n, 2)`` stamps between which a wheel truly slipped, if a simulator recorded them.
     """
-    motions = [d for d in result.decisions if d.kind in _SOURCES]
-    sightings = [d for d in result.decisions if d.landmark_id >= 0 or d.kind not in _NOT_SEEN]
+    motions = [d for d in result.decisions if _of_motion(d)]
+    sightings = [d for d in result.decisions if d.landmark_id >= 0 or not (_of_motion(d) or d.kind in _NOT_SEEN)]
     flags = _flags(result, result.decisions)
     known = [d for d in sightings if math.isfinite(d.nis) and d.dof > 0]
     axis = TimeAxis.of(result)
@@ -386,6 +385,11 @@ def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: Int
     if handles := _handles(result, motions, known, matched is not None, len(slips) > 0):
         legend(figure, handles)
     return figure
+
+
+def _of_motion(d: Decision) -> bool:
+    """Whether a row is of a motion source, or of a motion that none measured."""
+    return is_motion_source(d.kind) or d.kind == "unknown"
 
 
 def _poses(result: RunData) -> FloatArray:
@@ -464,7 +468,10 @@ def _bars(times: FloatArray, span: float, bridge: bool) -> list[tuple[float, flo
 
 def _weights(axes: Axes, result: RunData, decisions: Sequence[Decision]) -> None:
     """A row for each motion source: as high as its weight, and what was taken back at full height in red."""
-    kinds = [source for source in _SOURCES if any(d.kind == source for d in decisions)]
+    there = {d.kind for d in decisions}
+    kinds = [
+        kind for kind in (*MOTION_SOURCES, *sorted(there - {*MOTION_SOURCES, "unknown"}), "unknown") if kind in there
+    ]
     for row, kind in enumerate(kinds):
         last = {d.step: d for d in decisions if d.kind == kind}  # a step that was judged again has several rows
         held = sorted(last.values(), key=lambda d: d.stamp_ns)

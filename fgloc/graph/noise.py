@@ -188,17 +188,18 @@ class NoiseBudget:
         learned = None if learned is None or "learned" in self.rejected else _scaled(learned, scales["learned"])
         if gyro is None or "gyro" in self.rejected or (learned is not None and rules.learned_has_gyro):
             gyro = None
+        beside = [m for m in readings.beside if m.source not in self.rejected]
         if wheels is not None and "wheels" in self.rejected:
-            wheels = None if learned is not None else self._with_slip(wheels, rules)
+            wheels = None if learned is not None or beside else self._with_slip(wheels, rules)
         elif wheels is not None and learned is not None:
             if rules.wheels_are_commands:
                 wheels = None
             elif rules.joint is not None:
                 learned = rules.joint.decorrelate(wheels, learned)
-        known = [m for m in (wheels, learned) if m is not None]
+        known = [m for m in (wheels, learned, *beside) if m is not None]
         if gyro is not None and known:
             if rules.turns_by_gyro:
-                known = [replace(m, cov=m.cov + np.diag([0.0, 0.0, se2.ANY_YAW])) for m in known]
+                known = [replace(m, cov=m.cov + np.diag([0.0, 0.0, se2.ANY_YAW * (m not in beside)])) for m in known]
             known.append(replace(gyro, motion=with_yaw(known[0].motion, float(gyro.motion[2]))))
         if readings.inertial is not None:
             known = [replace(m, inertial=readings.inertial) for m in known]

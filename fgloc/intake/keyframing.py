@@ -166,7 +166,7 @@ class KeyframeBuilder:
         self._clock_notes = ClockNotes()
         self._index = 0
         self._segment = 0
-        self._motion: dict[type[MotionEvent], EventBuffer[MotionEvent]] = {}  # by class of event
+        self._motion: dict[tuple[type[MotionEvent], str], EventBuffer[MotionEvent]] = {}  # by class of event and topic
         self._roles = {stream.event: stream.role for stream in (*registry.streams(), *self._streams.values())}
         self._reset()
 
@@ -255,7 +255,7 @@ class KeyframeBuilder:
         assert isinstance(event, MotionEvent)
         if late and not (isinstance(event, ControlEvent) and late_ns < self._history_ns):
             self.rejections[f"{self._name(event)}.late"] += 1
-        elif not self._motion.setdefault(type(event), EventBuffer()).insert(event):
+        elif not self._motion.setdefault((type(event), event.topic), EventBuffer()).insert(event):
             self.rejections[f"{self._name(event)}.duplicate"] += 1
 
     def _insert_late(self, event: SightingsEvent | SensorEvent) -> None:
@@ -364,10 +364,7 @@ class KeyframeBuilder:
             segment=self._segment,
             start_ns=start,
             stamp_ns=stamp_ns,
-            motion={
-                kind: buffer.window(start - self._back_ns(kind), stamp_ns, beyond=not issubclass(kind, ControlEvent))
-                for kind, buffer in self._motion.items()
-            },
+            motion=self._motion_of(start, stamp_ns),
             sightings=tuple(e for e in self._pending[:handed] if not isinstance(e, SensorEvent)),
             sensed=(
                 *(e for e in self._pending[:handed] if isinstance(e, SensorEvent)),
@@ -379,9 +376,19 @@ class KeyframeBuilder:
             self._first_ns = stamp_ns
         self._last_ns = stamp_ns
         self._index += 1
-        for kind, buffer in self._motion.items():
+        for (kind, _), buffer in self._motion.items():
             buffer.trim(stamp_ns - self._back_ns(kind))
         return step
+
+    def _motion_of(self, start_ns: int, end_ns: int) -> dict[type[MotionEvent], tuple[MotionEvent, ...]]:
+        """Events of a step by class, in order of stamp; of each topic those that it takes to integrate over it."""
+        found: dict[type[MotionEvent], tuple[MotionEvent, ...]] = {}
+        for (kind, _), buffer in self._motion.items():
+            beyond = not issubclass(kind, ControlEvent)
+            events = buffer.window(start_ns - self._back_ns(kind), end_ns, beyond)
+            both = (*found[kind], *events) if kind in found else events
+            found[kind] = both if both is events else tuple(sorted(both, key=lambda e: e.stamp_ns))
+        return found
 
     def _back_ns(self, kind: type[MotionEvent]) -> int:
         """Span before a step for which events are kept [ns]."""

@@ -297,7 +297,7 @@ class Live(registry.SensorInput):
         """Stamp as the configuration corrects it, receive time and topic."""
         received = time.time_ns()
         stamp = received if role in self._recording.received_stamps else int(stamp_ns)
-        given: str | None = getattr(self._recording.topics, role)
+        given = self._recording.beside.get(role) or self._recording.topics.given(role)
         return stamp + round(self._recording.stamp_offset_s.get(role, 0.0) * 1e9), received, given or role
 
     def _deliver(self, event: Event) -> None:

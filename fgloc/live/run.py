@@ -10,7 +10,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble_stream
-from fgloc.config import Config, Role, role_names
+from fgloc.config import ODOMETRIES, Config, Role, role_names
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.extrapolation import Anchor, Anchors
 from fgloc.live.state import (
@@ -94,18 +94,28 @@ class LiveFacts:
 
     def topic_is_used(self, event: Event) -> bool:
         """Whether the event is of the one topic that plays its role: the configured one, else the first."""
-        role = role_of(event)
+        role = self._role_of(event)
         if role is None:
             return True
-        given: str | None = getattr(self._config.recording.topics, role)
+        given = self._given(role)
         if given == "none" or given not in (None, event.topic):
             return False
         return self._topics.setdefault(role, event.topic) == event.topic
 
     def is_configured(self, event: Event) -> bool:
         """Whether the configuration names the topic that plays the event's role, or none."""
-        role = role_of(event)
-        return role is not None and getattr(self._config.recording.topics, role) is not None
+        role = self._role_of(event)
+        return role is not None and self._given(role) is not None
+
+    def _role_of(self, event: Event) -> Role | None:
+        """Role of an event's topic, also of an odometry beside the wheels; None if it needs none."""
+        beside = {topic: role for role, topic in self._config.recording.beside.items()}
+        return beside.get(event.topic) or role_of(event)
+
+    def _given(self, role: Role) -> str | None:
+        """Topic that the configuration gives a role; "none": it is not to be used."""
+        recording = self._config.recording
+        return "none" if role == ODOMETRIES else recording.beside.get(role) or recording.topics.given(role)
 
     @property
     def first(self) -> Mapping[type[Event], Event]:
@@ -114,7 +124,7 @@ class LiveFacts:
 
     def is_there(self, event: Event) -> bool:
         """Whether everything is known that is needed to use an event."""
-        role = role_of(event)
+        role = self._role_of(event)
         return role is None or role in _NOT_BUILT_FROM or role in self.roles
 
     def is_news(self, event: Event) -> bool:
@@ -141,7 +151,7 @@ class LiveFacts:
     def waiting_for(self) -> tuple[str, ...]:
         """Missing parts of the stream, a phrase each."""
         missing = []
-        for role in role_names():
+        for role in (*role_names(), *self._config.recording.beside):
             if role in self.roles or role in _NOT_BUILT_FROM:
                 continue
             if role in self._topics:

@@ -143,15 +143,18 @@ class Selection:
     problems: tuple[str, ...]  # ambiguities, and configured topics that do not fit
 
 
-def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection:
+def select_roles(
+    topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str] | None = None
+) -> Selection:
     """Find a topic for each role.
 
     Args:
         topics: all topics; those without messages are no candidates.
         config: topics given by the user; they win, and "none" switches a role off.
+        beside: topics of the odometries beside the wheels, by role.
     """
     notes: list[str] = []
-    roles, problems = _given_roles(topics, config)
+    roles, problems = _given_roles(topics, config, beside or {})
     filled = [topic for topic in topics if topic.count > 0]
     for role in sorted(role_names(), key=_by_dependence):
         if config.given(role) is not None:
@@ -167,9 +170,11 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
                 f"No {role}: {', '.join(candidates)} could be it; choose one with recording.topics.{role}, or none."
             )
         elif candidates:
+            none = f"none (recording.topics.{role}: none)"
+            none += "; list others in recording.odometries to use them too" if role == "odometry" else ""
             problems.append(
                 f"{len(candidates)} topics could be the {role}: {', '.join(candidates)}; choose one in the "
-                f"configuration (recording.topics.{role}: {candidates[0]}), or none (recording.topics.{role}: none)"
+                f"configuration (recording.topics.{role}: {candidates[0]}), or {none}"
             )
         else:
             notes.append(_unnamed(role, filled))
@@ -178,18 +183,20 @@ def select_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> Selection
     return Selection(roles, tuple(note for note in notes if note), tuple(problems))
 
 
-def _given_roles(topics: Sequence[TopicInfo], config: TopicsConfig) -> tuple[dict[Role, str], list[str]]:
+def _given_roles(
+    topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str]
+) -> tuple[dict[Role, str], list[str]]:
     """Roles that the user gave, and what is wrong with them."""
     roles: dict[Role, str] = {}
     problems: list[str] = []
-    for role in role_names():
-        given = config.given(role)
+    for role, given in (*((role, config.given(role)) for role in role_names()), *beside.items()):
         if given is None or given == "none":
             continue
-        if problem := _misfit(role, given, topics):
+        key = "recording.odometries" if role in beside else f"recording.topics.{role}"
+        if problem := _misfit(role, given, topics, key):
             problems.append(problem)
         elif given in roles.values():
-            problems.append(f"recording.topics.{role}: {given} is given for another role too; choose one of them")
+            problems.append(f"{key}: {given} is given for another role too; choose one of them")
         else:
             roles[role] = given
     return roles, problems
@@ -275,19 +282,19 @@ def _choose(role: Role, candidates: list[str], image: str | None) -> tuple[str |
     return None, ""
 
 
-def _misfit(role: Role, given: str, topics: Iterable[TopicInfo]) -> str:
-    """Reason why a configured topic does not fit; empty if it fits."""
+def _misfit(role: Role, given: str, topics: Iterable[TopicInfo], key: str) -> str:
+    """Reason why a topic that is configured under a key does not fit; empty if it fits."""
     types = converters_of(role)
     found = next((topic for topic in topics if topic.name == given), None)
     fitting = [topic.name for topic in topics if topic.message_type in types and topic.count > 0]
     remedy = f"choose {' or '.join(fitting)}" if fitting else f"the recording has no topic for the {role}: use none"
     if found is None:
-        return f"recording.topics.{role}: {given} is not in the recording; {remedy}"
+        return f"{key}: {given} is not in the recording; {remedy}"
     if found.message_type not in types:
         expected = " or ".join(types)
-        return f"recording.topics.{role}: {given} is a {found.message_type}, expected {expected}; {remedy}"
+        return f"{key}: {given} is a {found.message_type}, expected {expected}; {remedy}"
     if found.count == 0:
-        return f"recording.topics.{role}: {given} has no messages; {remedy}"
+        return f"{key}: {given} has no messages; {remedy}"
     return ""
 
 
@@ -358,7 +365,7 @@ class Recording:
         for channel in sorted(channels, key=lambda c: (c.topic, -c.count)):
             known = found.setdefault(channel.topic, TopicInfo(channel.topic, channel.message_type, 0))
             found[channel.topic] = replace(known, count=known.count + channel.count)
-        selection = select_roles(tuple(found.values()), config.topics)
+        selection = select_roles(tuple(found.values()), config.topics, config.beside)
         self.roles: Mapping[Role, str] = selection.roles
         self.problems = selection.problems
         role_of: dict[str, Role] = {topic: role for role, topic in selection.roles.items()}

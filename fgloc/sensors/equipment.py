@@ -18,6 +18,7 @@ from fgloc.sensors.landmarks import SightingContext
 from fgloc.sensors.learned.network import JointCalibration
 from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc.sensors.measurements import LandmarkMeasurement, LandmarkSighting
+from fgloc.sensors.odometry import BesideOdometry
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
     Camera,
@@ -94,6 +95,7 @@ class MotionSensors:
         gyro: the gyro, if any.
         attitude: roll and pitch, on uneven ground; None: it is flat, or nothing measures them.
         alone: nothing in the stream can tell where the robot is.
+        beside: odometries beside the wheels.
     """
 
     wheels: WheelMotion
@@ -102,6 +104,7 @@ class MotionSensors:
     gyro: Gyro | None = None
     attitude: Attitude | None = None
     alone: bool = False
+    beside: Sequence[BesideOdometry] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator
 
+from fgloc.config import BESIDE, ODOMETRIES
 from fgloc.extensions import outside_sensors
 from fgloc.files.settings import Section
 from fgloc.sensors.base import (
@@ -26,6 +27,7 @@ from fgloc.sensors.learned.sensor import LEARNED
 from fgloc.sensors.marker_pose import MARKER_POSE
 from fgloc.sensors.markers.sensor import MARKERS, MarkersInput
 from fgloc.sensors.measurements import LandmarkSighting
+from fgloc.sensors.odometry import ODOMETRY, OdometriesInput
 from fgloc.sensors.range_bearing import RANGE_BEARING, RangeBearingInput
 from fgloc.sensors.wheels.events import WheelsInput
 from fgloc.sensors.wheels.sensor import WHEELS
@@ -37,11 +39,20 @@ if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext
 
 
-class SensorInput(WheelsInput, CommandInput, GyroInput, MarkersInput, RangeBearingInput):
+class SensorInput(WheelsInput, OdometriesInput, CommandInput, GyroInput, MarkersInput, RangeBearingInput):
     """Methods that make the events of the built-in sensors from plain numbers."""
 
 
-BUILT_IN: tuple[BuiltIn, ...] = (WHEELS, COMMANDS, GYRO, LEARNED, MARKERS, MARKER_POSE, RANGE_BEARING)
+BUILT_IN: tuple[BuiltIn, ...] = (
+    WHEELS,
+    ODOMETRY,
+    COMMANDS,
+    GYRO,
+    LEARNED,
+    MARKERS,
+    MARKER_POSE,
+    RANGE_BEARING,
+)
 MOTION_INSTALLATIONS = tuple(sensor.installation for sensor in BUILT_IN if sensor.installation is not None)
 
 
@@ -72,7 +83,8 @@ def _role_by_class(outside: tuple[type[Sensor], ...]) -> dict[type[Event], str]:
 
 def streams_of(role: str) -> tuple[Stream, ...]:
     """Streams that a role may have: for each class of events one."""
-    return tuple(stream for stream in streams() if stream.role == role)
+    kind = ODOMETRIES if role.startswith(BESIDE) else role
+    return tuple(stream for stream in streams() if stream.role == kind)
 
 
 def converters(role: str) -> Mapping[str, Converter]:

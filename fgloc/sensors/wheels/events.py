@@ -29,8 +29,8 @@ from fgloc.types import Event, FloatArray, MotionEvent, OdometerPose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryEvent(MotionEvent):
-    """``nav_msgs/Odometry``: pose of ``child_frame_id`` in ``frame_id`` and body twist."""
+class PoseAndTwistEvent(MotionEvent):
+    """Content of ``nav_msgs/Odometry``: pose of ``child_frame_id`` in ``frame_id`` and body twist."""
 
     frame_id: str
     child_frame_id: str
@@ -40,6 +40,11 @@ class OdometryEvent(MotionEvent):
     linear: FloatArray  # (3,) m/s
     angular: FloatArray  # (3,) rad/s
     twist_cov: FloatArray  # (6, 6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryEvent(PoseAndTwistEvent):
+    """``nav_msgs/Odometry`` of the wheels."""
 
     @property
     def base_frame_id(self) -> str:
@@ -70,8 +75,12 @@ class JointsEvent(MotionEvent):
 
 def from_odometry(m: Any, when: When) -> Event:
     """Event of a ``nav_msgs/Odometry``."""
-    return OdometryEvent(
-        *when,
+    return OdometryEvent(*when, *odometry_fields(m))
+
+
+def odometry_fields(m: Any) -> tuple[Any, ...]:
+    """Fields of a `PoseAndTwistEvent` after the first three, of a ``nav_msgs/Odometry``."""
+    return (
         m.header.frame_id,
         m.child_frame_id,
         xyz(m.pose.pose.position),
@@ -105,11 +114,11 @@ _NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_co
 _NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
 
 
-def odometry_validator(checks: FieldChecks) -> Callable[[OdometryEvent], Event | str]:
+def odometry_validator(checks: FieldChecks) -> Callable[[PoseAndTwistEvent], Event | str]:
     """Validator of odometry: pose and twist are judged apart."""
     bounds = checks.config
 
-    def validate(event: OdometryEvent) -> Event | str:
+    def validate(event: PoseAndTwistEvent) -> Event | str:
         config = bounds
         changes: Changes = {}
         vx, vy, vz = event.linear.tolist()
@@ -207,7 +216,7 @@ class OdometryChecks:
 
     def add(self, event: Event) -> None:
         """Add one event."""
-        assert isinstance(event, OdometryEvent)
+        assert isinstance(event, PoseAndTwistEvent)
         self._rows.add(
             *event.position[:2],
             *event.orientation,

@@ -15,7 +15,7 @@ from fgloc import se2
 from fgloc.config import WheelsConfig
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.sensors.failures import Carriage, Change, EventFailure, Failure, Scene
-from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent, PoseAndTwistEvent
 from fgloc.types import Event, FloatArray
 
 
@@ -392,7 +392,7 @@ class JoinedWheels:
 
     def __call__(self, event: Event, shift: int) -> Event:
         """Event as if nothing had been cut out before it; ``shift`` is the length of what was cut out [ns]."""
-        assert isinstance(event, JointsEvent | OdometryEvent)
+        assert isinstance(event, JointsEvent | PoseAndTwistEvent)
         angles = isinstance(event, JointsEvent)
         now = event.position if isinstance(event, JointsEvent) else _pose(event)
         carried, self._shift = shift != self._shift, shift
@@ -405,11 +405,11 @@ class JoinedWheels:
         return event
 
 
-def _pose(event: OdometryEvent) -> FloatArray:
+def _pose(event: PoseAndTwistEvent) -> FloatArray:
     return np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
 
 
-def _told(event: JointsEvent | OdometryEvent, now: FloatArray) -> JointsEvent | OdometryEvent:
+def _told(event: JointsEvent | PoseAndTwistEvent, now: FloatArray) -> JointsEvent | PoseAndTwistEvent:
     if isinstance(event, JointsEvent):
         return replace(event, position=now)
     position = np.array([now[0], now[1], event.position[2]])
@@ -438,7 +438,7 @@ class _Held:
         self._last: FloatArray | None = None  # as reported
         self._last_ns = 0
 
-    def tell(self, event: JointsEvent | OdometryEvent, lifted: bool) -> JointsEvent | OdometryEvent:
+    def tell(self, event: JointsEvent | PoseAndTwistEvent, lifted: bool) -> JointsEvent | PoseAndTwistEvent:
         """Event as the wheels in the air, or on the floor again, would report it."""
         angles = isinstance(event, JointsEvent)
         now = event.position if isinstance(event, JointsEvent) else _pose(event)
@@ -455,7 +455,9 @@ class _Held:
         self._last, self._last_ns = now, event.stamp_ns
         return event
 
-    def _told(self, event: JointsEvent | OdometryEvent, now: FloatArray, lifted: bool) -> JointsEvent | OdometryEvent:
+    def _told(
+        self, event: JointsEvent | PoseAndTwistEvent, now: FloatArray, lifted: bool
+    ) -> JointsEvent | PoseAndTwistEvent:
         if isinstance(event, JointsEvent):
             if not lifted:
                 return replace(event, position=now)
