@@ -110,12 +110,15 @@ def clean(stamps: IntArray, poses: FloatArray) -> Trajectory:
     return Trajectory(stamps, poses)
 
 
-def textbook(heard: Heard, landmarks: Mapping[int, FloatArray]) -> tuple[Trajectory, Trajectory] | None:
+def textbook(
+    heard: Heard, landmarks: Mapping[int, FloatArray], begun: tuple[int, FloatArray] | None = None
+) -> tuple[Trajectory, Trajectory] | None:
     """Online and smoothed poses of iSAM2 at odometry stamps; None without odometry or sightings.
 
     Args:
         heard: content of the bag.
         landmarks: places ``(2,)`` of the map in the truth's frame; empty: they are variables from the origin on.
+        begun: stamp [ns] and pose ``(3,)`` that it starts from on a map; None: the first of the truth.
     """
     if heard.odometry is None or not heard.sightings:
         return None
@@ -123,9 +126,12 @@ def textbook(heard: Heard, landmarks: Mapping[int, FloatArray]) -> tuple[Traject
     seen = [[one for one in row if not landmarks or one[0] in landmarks] for row in _by_step(stamps, heard.sightings)]
     pose = np.zeros(3)
     if landmarks and heard.truth is not None:
-        first = max(0, int(np.searchsorted(stamps, heard.truth.stamps_ns[0])))
+        first_ns, pose = begun or (int(heard.truth.stamps_ns[0]), pose)
+        first = int(np.searchsorted(stamps, first_ns))
         stamps, poses, seen = stamps[first:], poses[first:], seen[first:]
-        pose = heard.truth.interpolate(int(stamps[0]))
+        if not len(stamps):
+            return None
+        pose = pose if begun else heard.truth.interpolate(int(stamps[0]))
     kernel = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
     noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Diagonal.Sigmas(_SIGHTING))
     isam, known, online = gtsam.ISAM2(gtsam.ISAM2Params()), set[int](), []

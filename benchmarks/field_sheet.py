@@ -26,7 +26,7 @@ class Outcome:
         said: what ``init``, ``info``, ``smooth`` and ``online`` printed.
         codes: their exit codes; 124: longer than the limit.
         metrics: ``metrics.json`` of the two modes; empty: none was written.
-        ate: of "odometry", "textbook.batch", "textbook.online", "batch", "online" [m].
+        ate: of "odometry", "textbook.batch", "textbook.online", "alike.batch", "alike.online", "batch", "online" [m].
         error: why the recording could not be read for the comparison.
     """
 
@@ -43,9 +43,9 @@ class Outcome:
         lines = [line for line in self.said.get(mode, "").splitlines() if line.startswith("error")]
         return [{"code": "error", "severity": "error", "text": line} for line in lines[:1]]
 
-    def best(self, mode: Mode) -> float:
-        """Least ATE of odometry and textbook [m]; infinite: there is none."""
-        return min((self.ate[k] for k in ("odometry", f"textbook.{mode}") if k in self.ate), default=math.inf)
+    def best(self, mode: Mode, textbook: str = "textbook") -> float:
+        """Least ATE of odometry and a textbook ("textbook" or "alike") [m]; infinite: there is none."""
+        return min((self.ate[k] for k in ("odometry", f"{textbook}.{mode}") if k in self.ate), default=math.inf)
 
 
 @dataclass(frozen=True, slots=True)

@@ -177,8 +177,13 @@ class _Search:
             changed, self.config = (found.config.recording, found.config.map) != read, found.config
             if changed:
                 return True
+        placed = bool({"image", "sightings"} & recording.roles.keys()) or self.config.motion.model is not None
         for mistake in mistakes(signals.motion, self.config):
-            self._correct(mistake.code, mistake.sentence, mistake.section, **mistake.values)
+            if mistake.values:
+                self._correct(mistake.code, mistake.sentence, mistake.section, **mistake.values)
+            else:  # without the wheels' motion landmarks alone still tell the pose
+                severity = Severity.WARNING if placed else Severity.ERROR
+                self._setup.append(Finding(mistake.code, mistake.sentence, severity))
         if parts.landmark_map is None:
             return False
         if self._unseen(excerpt, parts) and not self._images(recording, parts):

@@ -16,6 +16,7 @@ from fgloc.diagnosis.signals import SignalCollector
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, InertialEvent, Severity
+from fgloc_datasets.bag import BagWriter
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "installed_run"
 
@@ -149,3 +150,28 @@ def test_a_map_that_images_contradict_is_named_with_its_mistake(tmp_path, config
     for key, shown in first.lines.items():
         names = key.removeprefix("expert.")
         assert np.isfinite(getattr(with_value(config, names, float(shown)).map, names.split(".")[1]))
+
+
+# --- Joints alone -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("per_turn", "drive", "code"),
+    [
+        (2 * math.pi, {}, "wheels.geometry"),
+        (8400.0, {"kind": "skid_steer", "radius": 0.07, "track": 0.34}, "wheels.ticks"),
+        (8400.0, {"kind": "skid_steer", "radius": 0.07, "track": 0.34, "ticks_per_turn": 8400.0}, None),
+        (2 * math.pi, {"kind": "skid_steer", "radius": 0.07, "track": 0.34}, None),
+    ],
+)
+def test_joints_that_tell_no_way_are_named_before_a_run(tmp_path, per_turn, drive, code):
+    names = ["front_left", "front_right", "rear_left", "rear_right"]
+    sides = {"left": [names[0], names[2]], "right": [names[1], names[3]]}
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(600):
+            turned = per_turn * (2.0 + 0.3 * math.sin(0.01 * k)) * 0.02 * k  # two turns a second
+            bag.joints("/joints", round((1.0 + 0.02 * k) * 1e9), names, position=[turned] * 4)
+    given = config_of_file({"wheels": {"drive": drive | sides} if drive else {}})
+    info = inspect_all(tmp_path / "bag", None, given)
+    codes = [f.code for f in info.found if f.severity is Severity.ERROR]
+    assert codes == ([] if code is None else [code])

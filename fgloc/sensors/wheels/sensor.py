@@ -414,15 +414,50 @@ _WHOLE_TURN = 0.02  # share by which a range may be off one turn to be taken as 
 
 
 def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
-    """Mistakes in the settings that the messages show: wheel angles that roll over."""
+    """Mistakes in the settings that the messages show: angles that roll over, or that cannot be turned into a way.
+
+    Args:
+        motion: events in order of receipt that no bound on speeds has sifted.
+        config: as given.
+    """
+    found = []
     rolled = roll_over(motion, config)
-    if rolled is None:
-        return ()
-    sentence = (
-        f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
-        f"set expert.wheels.angle_range: {rolled[0]:.4f}."
-    )
-    return (RawMistake("wheels.roll_over", sentence, "wheels", {"angle_range": rolled[0]}),)
+    if rolled is not None:
+        sentence = (
+            f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
+            f"set expert.wheels.angle_range: {rolled[0]:.4f}."
+        )
+        found.append(RawMistake("wheels.roll_over", sentence, "wheels", {"angle_range": rolled[0]}))
+    wheels = config.wheels
+    joints = [e for e in motion if isinstance(e, JointsEvent) and len(e.position) == len(e.names)]
+    others = any(isinstance(e, (OdometryEvent, ControlEvent)) for e in motion)
+    if len(joints) < 10 or wheels.source == "none" or (others and wheels.drive is None and wheels.source != "ticks"):
+        return tuple(found)
+    rate = _joint_rate(joints)
+    if wheels.in_radians and rate > config.gate.max_wheel_rate:
+        sentence = (
+            f"The angles of the wheels' joints change by {rate:.4g} rad/s: they are ticks or degrees, not radians. "
+            "Set wheels.drive with its ticks_per_turn (360 for degrees; docs/drives.md)."
+        )
+        found.append(RawMistake("wheels.ticks", sentence, "wheels", {}))
+    elif wheels.drive is None and None in (wheels.left_radius, wheels.right_radius, wheels.track):
+        sentence = (
+            "Joint states are the only motion of the wheels in the recording, and how they move the robot is not "
+            "given: set wheels.left_radius, wheels.right_radius and wheels.track, or wheels.drive (docs/drives.md)."
+        )
+        found.append(RawMistake("wheels.geometry", sentence, "wheels", {}))
+    return tuple(found)
+
+
+def _joint_rate(joints: Sequence[JointsEvent]) -> float:
+    """Rate [rad/s] that the fastest joint exceeds for a tenth of the time, if its angles are radians."""
+    names = joints[0].names
+    alike = [e for e in joints if e.names == names]
+    times = np.array([e.stamp_ns for e in alike]) * 1e-9
+    passed = np.diff(times)
+    steps = np.abs(np.diff([e.position for e in alike], axis=0))[passed > 0.0] / passed[passed > 0.0, None]
+    steps = steps[np.isfinite(steps).all(axis=1)]
+    return float(np.quantile(steps, 0.9, axis=0).max()) if len(steps) else 0.0
 
 
 def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | None:
