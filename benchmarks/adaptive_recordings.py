@@ -23,7 +23,7 @@ import yaml
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from fgloc.config import Config, MarkersConfig
+from fgloc.config import Config, MarkersConfig, config_of
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
@@ -133,7 +133,7 @@ def load(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> R
     made = job(floor, split, seed, change)
     record_missing([made])
     folder = cache_folder() / made.folder
-    config = Config.model_validate(robot_settings(made.scenario))
+    config = config_of(robot_settings(made.scenario))
     landmarks = load_map(folder / "map.yaml")
     with open_recording(folder / "bag", config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s

@@ -22,7 +22,7 @@ from pydantic import TypeAdapter
 from benchmarks.adaptive_recordings import Floor, Recorded, Split, load, moved_interval, slip_intervals
 from benchmarks.adaptive_scores import Figures, lost, score
 from fgloc.ablation.failures import AnyFailure, corrupt, generators
-from fgloc.config import Config
+from fgloc.config import Config, config_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import RunResult, run
 from fgloc.sensors.failures import Failure, Scene
@@ -216,7 +216,7 @@ def changed(config: Config, changes: Changes) -> Config:
     def merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
         return {**old, **{k: merged(old[k], v) if isinstance(v, Mapping) else v for k, v in new.items()}}
 
-    return Config.model_validate(merged(config.model_dump(), changes))
+    return config_of(merged(config.model_dump(), changes))
 
 
 def distrusting(intervals: Sequence[Interval]) -> dict[str, Any]:

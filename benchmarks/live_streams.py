@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.adaptive_recordings import Recorded
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, config_of
 from fgloc.frames import yaw_quaternion
 from fgloc.live import Live
 from fgloc.live.run import role_of
@@ -132,7 +132,7 @@ _SIGMA_RANGE, _SIGMA_BEARING = 0.06, 0.015
 
 def circle_config() -> Config:
     """Settings that fit the noise of `circle`."""
-    return Config.model_validate(
+    return config_of(
         {
             "wheels": {"source": "twist"},
             "landmarks": {"range_sigma_m": _SIGMA_RANGE, "bearing_sigma_rad": _SIGMA_BEARING},

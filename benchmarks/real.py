@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks import stills
 from benchmarks.common import Row, main, not_run
 from fgloc import se2
-from fgloc.config import Config, load_config
+from fgloc.config import Config, config_of, load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
@@ -155,7 +155,7 @@ def _configured(bag: Path, changes: dict[str, dict[str, object]], base: Config |
         raise FileNotFoundError(f"no robot.yaml beside {bag}")
     settings = (base or load_config(path)).model_dump()  # type: ignore[arg-type]
     _merge(settings, changes)
-    return Config.model_validate(settings)
+    return config_of(settings)
 
 
 def _merge(settings: dict, changes: dict) -> None:  # type: ignore[type-arg]

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.common import Row, main
 from fgloc import se2
-from fgloc.config import Config, load_config
+from fgloc.config import config_of, load_config
 from fgloc.estimation.localizer import Localizer
 from fgloc.frames import yaw_quaternion
 from fgloc.graph.estimators import FixedLag, isam2_params
@@ -124,7 +124,7 @@ class Chain:
     """Gate, stepper and localizer on a world, as the runner has them."""
 
     def __init__(self, world: World, keep_times: bool = False, keep_all: bool = False, with_model: bool = True) -> None:
-        config = Config.model_validate({"wheels": {"source": "twist"}})
+        config = config_of({"wheels": {"source": "twist"}})
         self.gate = EventValidator(config.gate, set(world.map.landmarks))
         self.stepper = KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s)
         wheels, landmarks = WheelMotion(config.wheels), LandmarkSensor(config, world.map, world.camera, None)

@@ -15,7 +15,7 @@ from benchmarks.adaptive_mrclam import _with_odometry
 from benchmarks.adaptive_recordings import Recorded, moved_interval, scenario, slip_intervals
 from benchmarks.adaptive_runs import CASES, changed, distrusting, failure, moved_id
 from benchmarks.adaptive_scores import Figures, Slips, flags, found_again, lost, slips
-from fgloc.config import Config
+from fgloc.config import Config, load_config, with_value
 from fgloc.runner import RunResult
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Decision, Landmark, LandmarkMap, Mode, Trajectory
@@ -176,3 +176,9 @@ def test_made_odometry_repeats_the_commands():
     assert made[1].position[0] == pytest.approx(0.2)
     assert made[2].position[:2] == pytest.approx([0.2, 0.0])
     assert [e.stamp_ns for e in events[::2]] == [e.stamp_ns for e in events[1::2]]
+
+
+def test_settings_of_a_file_can_be_changed():
+    samples = Path(__file__).parents[2] / "datasets" / "samples"
+    config = load_config(samples / "first_run" / "robot.yaml")
+    assert changed(config, {"gate": {"max_speed": 3.5}}) == with_value(config, "gate.max_speed", 3.5)
