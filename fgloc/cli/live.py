@@ -55,28 +55,30 @@ def live(
     view: Annotated[bool, typer.Option("--view", help="serve a page on loopback that shows the run")] = False,
 ) -> None:
     """Localize a robot on ROS 2's wire. ROS need not be installed; Ctrl-C ends with a summary."""
-    need("live", "fgloc live")
-    if view:
-        need("view", "fgloc live --view")
-    from fgloc.live.wire.node import Node
-    from fgloc.live.wire.participant import Participant
-    from fgloc.sensors.maps import configured_map
+    with _interrupted() as stop:
+        need("live", "fgloc live")
+        if view:
+            need("view", "fgloc live --view")
+        from fgloc.live.wire.node import Node
+        from fgloc.live.wire.participant import Participant
+        from fgloc.sensors.maps import configured_map
 
-    settings = _with_initial_pose(configured(None, config, model), initial_pose)
-    landmarks = None if map_file is None else configured_map(map_file, settings)
-    began = time.monotonic()
-    sys.setswitchinterval(_SWITCH_S)
-    with _interrupted() as stop, Participant(domain, network) as participant:
-        node = Node(participant, settings, landmarks, state)
-        say(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
-        gc.freeze()  # collecting what was imported would hold up publishing now and then, and the end by 0.3 s
-        try:
-            with _page(node, settings, landmarks) if view else nullcontext(_tell) as tell, _status_line(node, stop):
-                node.run(stop, tell)
-        finally:
-            node.close()
-        say(_summary(node, time.monotonic() - began))
-        _exit_if_wrong(node)
+        settings = _with_initial_pose(configured(None, config, model), initial_pose)
+        landmarks = None if map_file is None else configured_map(map_file, settings)
+        began = time.monotonic()
+        sys.setswitchinterval(_SWITCH_S)
+        with Participant(domain, network) as participant:
+            node = Node(participant, settings, landmarks, state)
+            say(f"domain {domain}, {'all networks' if network else 'loopback only'}; Ctrl-C ends")
+            gc.freeze()  # collecting what was imported would hold up publishing now and then, and the end by 0.3 s
+            try:
+                shown = _page(node, settings, landmarks) if view else nullcontext(_tell)
+                with shown as tell, _status_line(node, stop):
+                    node.run(stop, tell)
+            finally:
+                node.close()
+            say(_summary(node, time.monotonic() - began))
+            _exit_if_wrong(node)
 
 
 def play(

@@ -35,6 +35,7 @@ from fgloc.types import (
 )
 
 LONGEST_S = 600.0  # of a recording is looked at: enough for any convention, and bounded
+_MOST_VALUES = 1_000_000  # messages, joints and sightings in all; 600 s of a busy robot are half of it
 IMAGES: tuple[Role, ...] = ("image", "camera_info")
 GRID_S = 0.05  # of the wheels' path
 _FARTHEST = 1e9  # of a distance in any unit: more is no measurement
@@ -241,13 +242,19 @@ class SignalCollector:
         any_speed = any_unit | dict.fromkeys(("max_speed", "max_yaw_rate", "max_wheel_rate"), _FARTHEST)
         self._fast = EventValidator(reported_bounds(config).model_copy(update=any_speed))
         self._first_ns: int | None = None
+        self._values = 0
 
     def add(self, event: Event) -> bool:
-        """Store the signals of an event; False: it came after the end of the time to be read."""
+        """Store the signals of an event; False: it came after the end of the time to be read, or as too many."""
         if self._first_ns is None:
             self._first_ns = self.found.origin_ns = event.received_ns
-        if event.received_ns - self._first_ns > LONGEST_S * 1e9:
+        if event.received_ns - self._first_ns > LONGEST_S * 1e9 or self._values >= _MOST_VALUES:
             return False
+        self._values += 1
+        if isinstance(event, JointsEvent):
+            self._values += len(event.names)
+        elif isinstance(event, SightingsEvent):
+            self._values += len(event.sightings)
         role = self._role_of.get(event.topic)
         if role is not None:
             self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)

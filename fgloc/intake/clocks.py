@@ -161,6 +161,8 @@ _AGREE_NS = 500_000_000  # how much their delays may differ
 _ALIVE_NS = 2_000_000_000  # a topic without messages for longer is no reference
 _PATIENCE_NS = 3_000_000_000  # for how long messages are held back
 _SHARE = 0.1  # of a new delay in the mean
+_MOST_HELD = 5000  # messages of a source: 3 s of a fast sensor
+_MOST_SOURCES = 1000  # whose clocks are followed: joints may come under ever new names
 _STAMPED = (MotionEvent, RawEvent, SightingsEvent)
 
 
@@ -222,8 +224,9 @@ class TopicClocks:
         clock = self._clocks.get(source)
         delay = event.received_ns - event.stamp_ns
         if clock is None:
+            released = self._make_room()
             self._clocks[source] = _Clock(delay, event.received_ns)
-            return [event]
+            return [*released, event]
         clock.received_ns = event.received_ns
         delay -= clock.offset_ns
         if abs(delay - clock.delay_ns) <= _RESET_NS:
@@ -244,6 +247,12 @@ class TopicClocks:
         held = [e for clock in self._clocks.values() for e in clock.held]
         return sorted(held, key=lambda e: e.received_ns)
 
+    def _make_room(self) -> list[Event]:
+        """Forget the source that has been silent for longest if there are too many; return what was held of it."""
+        if len(self._clocks) < _MOST_SOURCES:
+            return []
+        return self._clocks.pop(min(self._clocks, key=lambda source: self._clocks[source].received_ns)).held
+
     def _suspect(self, clock: _Clock, event: Event) -> Iterator[Event]:
         held = clock.held
         if held and abs(_delay(event) - _delay(held[-1])) > _AGREE_NS:
@@ -256,7 +265,7 @@ class TopicClocks:
             held.clear()
         elif self._all_jumped(event.received_ns):
             yield from self._jump()
-        elif event.received_ns - held[0].received_ns > _PATIENCE_NS:
+        elif event.received_ns - held[0].received_ns > _PATIENCE_NS or len(held) >= _MOST_HELD:
             yield from held
             held.clear()
 

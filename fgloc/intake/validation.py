@@ -17,6 +17,7 @@ from fgloc.sensors.checks import EMPTIED, Changes, FieldChecks
 from fgloc.types import Event, TransformEvent, TruthEvent
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
+_MOST_NOTES, _LONGEST_NOTE = 40, 1000  # sentences, and characters of one
 _LEAST_SCALE = 1e-3  # of a rate: no unit of angle is smaller
 
 
@@ -185,4 +186,5 @@ class EventValidator:
         return replace(event, **changes) if changes else event
 
     def _note(self, text: str) -> None:
-        self._notes.setdefault(text)
+        if len(self._notes) < _MOST_NOTES:  # names in messages are in them
+            self._notes.setdefault(text[:_LONGEST_NOTE])

@@ -22,7 +22,7 @@ from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.live.engine import Estimation, LiveStatus, Settings, TopicStatus
 from fgloc.live.extrapolation import Anchor, Extrapolator, LivePose, MotionParts
 from fgloc.live.process import EstimationProcess
-from fgloc.live.run import LiveFacts, role_name
+from fgloc.live.run import MOST_NAMES, LiveFacts, role_name
 from fgloc.sensors import registry
 from fgloc.sensors.base import SENSOR, When
 from fgloc.sensors.learned.sensor import learned_motion
@@ -37,6 +37,7 @@ _SUCCESSION_NS = (
 )
 
 
+_MOST_TOPICS = 100  # that are received
 _MEAN_OF = 20  # messages, in the means of their interval and delay
 _clock_s = time.monotonic
 _STALE_S, _STALE_INTERVALS = 0.6, 4.0  # of silence: a wireless link's hiccup is shorter; users hear of it within 1 s
@@ -120,6 +121,10 @@ class Reception:
     def receive(self, event: Event, publisher: str) -> list[Event]:
         """Events that are to be used now: mostly this one; see `TopicClocks`."""
         role = role_name(event)
+        if event.topic not in self._meters and len(self._meters) >= _MOST_TOPICS:
+            self.dropped[role] += 1
+            self.note(f"more than {_MOST_TOPICS} topics: messages of further ones are not used")
+            return []
         if not isinstance(event, TransformEvent) and not self._is_of_its_publisher(event, publisher):
             self.dropped[role] += 1
             self.note(
@@ -133,7 +138,11 @@ class Reception:
 
     def _is_of_its_publisher(self, event: Event, publisher: str) -> bool:
         """Whether a message is of the one publisher that its topic should have; transforms have any number."""
-        first = self._publishers.setdefault(source_of(event), _Publisher(publisher, event.received_ns))
+        source = source_of(event)
+        first = self._publishers.pop(source, None) or _Publisher(publisher, event.received_ns)
+        self._publishers[source] = first  # the newest at the end
+        if len(self._publishers) > MOST_NAMES:  # joints of ever new names on one topic
+            del self._publishers[next(iter(self._publishers))]
         return first.has_the_topic(publisher, event.received_ns)
 
     def motion(self, event: Event) -> MotionEvent | None:

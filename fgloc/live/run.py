@@ -65,6 +65,8 @@ def role_name(event: Event) -> str:
 MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
 _WITH_CAMERA: frozenset[Role] = frozenset({"image", "sightings"})
 _NOT_BUILT_FROM: frozenset[Role] = frozenset({"camera_info", "truth"})
+MOST_NAMES = 1000  # of frames and publishers that are kept: a robot has tens, and what invents names has no end
+_LONGEST_NAME = 255  # characters of a frame; ROS and tf2 set no bound
 
 
 class LiveFacts:
@@ -75,6 +77,7 @@ class LiveFacts:
 
     Attributes:
         roles: topic of each role that is there.
+        left_out: transforms that were not kept, as there are too many pairs of frames.
     """
 
     name = "the live stream"
@@ -83,12 +86,13 @@ class LiveFacts:
         """Take the roles that are to be waited for (None: whatever comes), and the camera if it is known already."""
         self.camera = camera
         self.roles: dict[Role, str] = {}
+        self.left_out = 0
         self._seen: dict[type[Event], Event] = {}
         self.image_size: tuple[int, int] | None = None
         self.expected = None if expected is None else frozenset(expected) - _NOT_BUILT_FROM
         self._config = config
         self._topics: dict[Role, str] = {}  # the first topic of each role; others are not used
-        self._transforms: dict[tuple[str, str], list[TransformEvent]] = {}
+        self._transforms: dict[bool, dict[tuple[str, str], list[TransformEvent]]] = {False: {}, True: {}}  # by static
         self._frames: FrameTree | None = None
         self._incomplete = False  # a role has come in that lacks something
 
@@ -179,7 +183,7 @@ class LiveFacts:
     def frames(self) -> FrameTree:
         """Tree of all transforms so far."""
         if self._frames is None:
-            self._frames = FrameTree(t for same in self._transforms.values() for t in same)
+            self._frames = FrameTree(t for pairs in self._transforms.values() for same in pairs.values() for t in same)
         return self._frames
 
     def _missing(self, role: Role) -> str:
@@ -200,10 +204,20 @@ class LiveFacts:
         return ""
 
     def _add_transform(self, event: TransformEvent) -> None:
-        """Keep of each pair of frames the first transform, and one that differs: the pair moves."""
-        same = self._transforms.setdefault((event.parent, event.child), [])
+        """Keep of each pair of frames the first transform, and one that differs: the pair moves.
+
+        Pairs beyond `MOST_NAMES` are left out, of fixed and of other transforms apart: what moves under ever new names
+        takes no room of the robot's mountings.
+        """
+        pair, alike = (event.parent, event.child), self._transforms[event.static]
+        same = alike.get(pair, [])
         if len(same) > 1 or (same and _equal(same[0], event)):
             return
+        if not same:
+            if len(alike) >= MOST_NAMES or max(map(len, pair)) > _LONGEST_NAME:
+                self.left_out += 1
+                return
+            alike[pair] = same
         same.append(event)
         self._frames = None
 
@@ -391,7 +405,8 @@ class OnlineRun:
     @property
     def rejections(self) -> Counter[str]:
         """Number of rejected events and parts of them, by reason."""
-        return self._past_rejections + (Counter() if self.parts is None else self.parts.rejections)
+        now = Counter() if self.parts is None else self.parts.rejections
+        return self._past_rejections + now + Counter({"transform.too_many_frames": self.facts.left_out})
 
     def comparison(self) -> Callable[[], None] | None:
         """Function that compares the signals so far, takes a second or two and may run in any thread; None: not due."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.error import URLError
 from urllib.parse import quote
-from urllib.request import urlopen
+from urllib.request import ProxyHandler, build_opener
 
 from fgloc.errors import OutputError
 from fgloc.view.scene import Scene, import_rerun, new_stream
@@ -26,6 +26,7 @@ _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "  # the page is script and WebAssembly in one
     f"connect-src 'self' data: blob: http://{HOST}:*"
 )
+_direct = build_opener(ProxyHandler({}))  # a proxy of the environment does not reach this machine's loopback
 _PASSED = ("Content-Type", "Content-Encoding", "Content-Length")
 
 
@@ -45,7 +46,7 @@ class PrivatePage:
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 try:
-                    with urlopen(f"http://{HOST}:{source_port}{self.path}") as answer:
+                    with _direct.open(f"http://{HOST}:{source_port}{self.path}") as answer:
                         content = answer.read()
                         passed = {name: answer.headers[name] for name in _PASSED if name in answer.headers}
                 except URLError:  # no such file, or the server has ended

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import bisect
-import os
 import threading
 from collections import defaultdict, deque
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.errors import OutputError
+from fgloc.files.atomic import atomic_file
 from fgloc.results import RunData
 from fgloc.types import Decision, Estimate, FloatArray, Landmark, LandmarkMap
 
@@ -236,21 +235,13 @@ def write_rrd(result: RunData, path: Path) -> None:
     Raises:
         OutputError: rerun is not installed, or the file cannot be written.
     """
-    unfinished = path.with_name(path.name + ".part")
     stream = new_stream()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.touch()
-        stream.save(unfinished)
-        draw(result, stream)
-        stream.flush()
-        stream.disconnect()
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another place with --rrd") from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink()
+    encoded = stream.binary_stream()  # rerun's own writer waits for ever where the disk is full
+    draw(result, stream)
+    content = encoded.read() or b""
+    stream.disconnect()
+    with atomic_file(path, binary=True) as file:
+        file.write(content)
 
 
 def draw(result: RunData, stream: RecordingStream) -> None:

@@ -18,6 +18,8 @@ from wire import DOMAIN, wait_until
 import fgloc
 from fgloc import se2
 from fgloc.cli import app
+from fgloc.cli import live as commands
+from fgloc.cli.options import configured
 from fgloc.config import Config, load_config
 from fgloc.errors import WireError
 from fgloc.frames import quaternion_yaw, yaw_quaternion
@@ -344,6 +346,21 @@ def test_two_commands_as_two_processes(tmp_path):
     assert "Subscribed: /odom (odometry)." in said
     assert "last mode" in said
     assert (tmp_path / "state.json").stat().st_size > 100
+
+
+def test_ctrl_c_while_live_starts_ends_it_as_later(monkeypatch):
+    def interrupted(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return configured(*arguments)
+
+    monkeypatch.setattr(commands, "configured", interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        done = CliRunner().invoke(app, ["live", "--domain", str(DOMAIN)])
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done.exit_code == 0, done.output
+    assert "duration" in done.stdout
 
 
 @pytest.mark.parametrize("arguments", [["live"], ["play", str(SAMPLE / "bag")]])

@@ -1,6 +1,7 @@
 """What is to be seen of a run: in a file, and on a page that is served on loopback only."""
 
 import os
+import resource
 import subprocess
 import sys
 import urllib.error
@@ -109,8 +110,19 @@ def test_the_error_is_that_against_the_truth(tmp_path):
 
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="--rrd"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_rrd(result(3), tmp_path / "file" / "run.rrd")
+
+
+def test_on_a_full_disk_the_error_says_so_and_nothing_is_left(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
+    try:
+        with pytest.raises(OutputError, match="cannot be written"):
+            write_rrd(result(100), tmp_path / "run.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_rerun_the_remedy_is_named(monkeypatch):
@@ -142,16 +154,22 @@ def listening(pid):
     return addresses
 
 
-def test_the_page_is_on_loopback_and_may_connect_nowhere_else():
+def test_the_page_is_on_loopback_and_may_connect_nowhere_else(monkeypatch):
+    """Nor does it ask a proxy that the environment names for what is on this machine."""
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
     with Page() as page:
         assert page.url.startswith("http://127.0.0.1:")
         assert listening(page._server.pid) == {"0100007F"}  # 127.0.0.1, and no other
-        with urllib.request.urlopen(page.url) as answer:
+        with direct.open(page.url) as answer:
             assert b"re_viewer" in answer.read()
             policy = answer.headers["Content-Security-Policy"]
         assert "connect-src 'self' data: blob: http://127.0.0.1:*" in policy
         with pytest.raises(urllib.error.HTTPError, match="404"):
-            urllib.request.urlopen(f"{page.url.split('?')[0]}nothing.js")
+            direct.open(f"{page.url.split('?')[0]}nothing.js")
         pid = page._server.pid
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)

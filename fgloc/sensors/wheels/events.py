@@ -110,6 +110,7 @@ def from_ackermann_stamped(m: Any, when: When) -> Event:
 
 
 _MAX_ANGLE = 1e15  # rad or ticks, of a joint: beyond it a double has no whole ticks
+_MOST_JOINTS = 1000  # of a message: a humanoid with hands has a hundred
 _NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_cov=np.zeros((6, 6)))
 _NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
 
@@ -178,12 +179,13 @@ def joints_validator(checks: FieldChecks) -> Callable[[JointsEvent], Event | str
         ):
             array: FloatArray = getattr(event, name)
             values: list[float] = array.tolist()
-            if n == 0 or len(values) not in (0, n):
+            if not 0 < n <= _MOST_JOINTS or len(values) not in (0, n):
                 return "length"
             good = [abs(value) <= bound and math.isfinite(value) for value in values]
             if name != "effort":
                 usable += sum(good)
-                measured.update((event.topic, event.names[i], name) for i in range(len(values)) if good[i])
+                if len(measured) < _MOST_JOINTS * 4:
+                    measured.update((event.topic, event.names[i], name) for i in range(len(values)) if good[i])
             if all(good):
                 continue
             if all(math.isnan(value) for value in values):  # a driver's way to say that it has none
