@@ -11,8 +11,9 @@ from pathlib import Path
 import yaml
 
 from fgloc.config import Config, Role, config_of_file
-from fgloc.diagnosis.conventions import Conventions, conventions
-from fgloc.diagnosis.pairs import Noise
+from fgloc.diagnosis.comparison import Conventions
+from fgloc.diagnosis.conventions import conventions
+from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES

@@ -116,7 +116,7 @@ def outside(signals: Signals, found: Handling) -> Signals:
 def cut(path: Path, found: Handling) -> Path:
     """Path of the wheels, its motion marked as unknown in the handled stretches."""
     handled = _inside(path.times, found.spans)
-    return Path(path.times, path.poses, path.gaps + np.cumsum(handled))
+    return replace(path, gaps=path.gaps + np.cumsum(handled))
 
 
 def _steps(signals: Signals, config: Config, up: FloatArray) -> Iterator[tuple[Step, MotionReadings]]:

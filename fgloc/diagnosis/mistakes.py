@@ -17,8 +17,9 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, Role
-from fgloc.diagnosis.conventions import conventions, first_pose_sentence, truth_sentence
+from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.handling import FloorWatch
+from fgloc.diagnosis.landmarks import first_pose_sentence
 from fgloc.diagnosis.setup import Checked, by_places, check_fit, shown
 from fgloc.diagnosis.setup_fit import Excerpt, ExcerptCollector, read_excerpt
 from fgloc.diagnosis.signals import (
@@ -28,6 +29,7 @@ from fgloc.diagnosis.signals import (
     clock_sentence,
     other_clocks,
 )
+from fgloc.diagnosis.truth import truth_sentence
 from fgloc.errors import FglocError
 from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording

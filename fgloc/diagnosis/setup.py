@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fgloc.config import Config, Role, one_line, setting
-from fgloc.diagnosis.conventions import unit_of
+from fgloc.diagnosis.comparison import unit_of
 from fgloc.diagnosis.setup_fit import EXTRAS, Excerpt, Fit, Problem, Setup, Stretch, tells_place
 from fgloc.frames import OPTICAL_TO_BODY, quaternion_matrix, rotation_of, rpy_matrix, sensor_pose
 from fgloc.sensors.base import with_values

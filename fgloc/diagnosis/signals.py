@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,7 +40,7 @@ IMAGES: tuple[Role, ...] = ("image", "camera_info")
 GRID_S = 0.05  # of the wheels' path
 _FARTHEST = 1e9  # of a distance in any unit: more is no measurement
 _SPIKE = 20.0  # times the rate that one of a hundred exceeds: more is no turn
-_SILENT_S = 0.6  # without a message of the wheels their motion is not known
+SILENT_S = 0.6  # without a message of the wheels their motion is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,11 +61,15 @@ class Path:
     """Motion of the base by its odometry: ``times (n,)`` [s], ``poses (n, 3)`` with a continuous yaw.
 
     ``gaps`` ``(n,)`` counts the silences before each time: motion between times with different counts is not known.
+    ``source`` is that of the motion, as the odometer has it: "ticks", "odometry", "command"; ``by_twist``: whether it
+    is an odometry's twist.
     """
 
     times: FloatArray
     poses: FloatArray
     gaps: IntArray
+    source: str = ""
+    by_twist: bool = False
 
     def at(self, times: FloatArray) -> FloatArray:
         """Poses ``(m, 3)`` at some times; NaN outside the path."""
@@ -90,7 +94,7 @@ class Path:
         yaw, before = self.poses[:, 2], np.append(self.poses[:1, 2], self.poses[:-1, 2])
         steps = np.diff(self.poses[:, 0] + 1j * self.poses[:, 1], prepend=complex(*self.poses[0, :2]))
         place = np.cumsum(steps * np.exp(1j * (factor - 1.0) * 0.5 * (yaw + before)))
-        return Path(self.times, np.column_stack([place.real, place.imag, factor * yaw]), self.gaps)
+        return replace(self, poses=np.column_stack([place.real, place.imag, factor * yaw]))
 
     @property
     def way(self) -> FloatArray:
@@ -130,8 +134,6 @@ class Signals:
         images: whether the recording has images, which are not read here.
         odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
         delays: received minus stamped [s], by role.
-        source: of the motion, as the odometer has it: "ticks", "odometry", "command"; "": no path was asked for.
-        by_twist: whether it is an odometry's twist.
     """
 
     origin_ns: int = 0
@@ -144,8 +146,6 @@ class Signals:
     widest: float = 0.0
     images: bool = False
     delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
-    source: str = ""
-    by_twist: bool = False
 
     def late_s(self) -> dict[Role, float]:
         """Median of received minus stamped [s] of each role with enough messages."""
@@ -176,23 +176,23 @@ class Signals:
             measured = wheels.measure(step)
             motion = np.zeros(3) if measured is None else measured.motion
             last = max(int(ends[k]) - 1, 0)
-            if measured is None or silence[last] > _SILENT_S:
+            if measured is None or silence[last] > SILENT_S:
                 gap += 1
             pose = se2.compose(poses[-1], motion)
             yaw += float(motion[2])
             poses.append(np.array([pose[0], pose[1], yaw]))
             gaps.append(gap)
-        self.source, self.by_twist = wheels.source, wheels.by_twist
-        if not self.source:
+        if not wheels.source:
             return None
-        return Path((grid - self.origin_ns) * 1e-9, np.array(poses), np.array(gaps, dtype=np.int64))
+        times, counts = (grid - self.origin_ns) * 1e-9, np.array(gaps, dtype=np.int64)
+        return Path(times, np.array(poses), counts, wheels.source, wheels.by_twist)
 
     def odometry_path(self) -> Path | None:
         """Motion by the odometry's poses; None: too few."""
         rows = in_order(self.odometry)
         if len(rows) < 50:
             return None
-        gaps = np.cumsum(np.diff(rows[:, 0], prepend=rows[0, 0]) > _SILENT_S, dtype=np.int64)
+        gaps = np.cumsum(np.diff(rows[:, 0], prepend=rows[0, 0]) > SILENT_S, dtype=np.int64)
         return Path(rows[:, 0], np.column_stack([rows[:, 1:3], np.unwrap(rows[:, 3])]), gaps)
 
     def commanded(self, hold_s: float) -> tuple[FloatArray, FloatArray] | None:

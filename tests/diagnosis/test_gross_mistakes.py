@@ -15,10 +15,11 @@ from fgloc import cli
 from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
-from fgloc.diagnosis.conventions import first_pose_sentence, truth_sentence
+from fgloc.diagnosis.landmarks import first_pose_sentence
 from fgloc.diagnosis.setup import check_fit, mirrored, swapped
 from fgloc.diagnosis.setup_fit import Picture, read_excerpt
 from fgloc.diagnosis.signals import clock_sentence, other_clocks
+from fgloc.diagnosis.truth import truth_sentence
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.frames import rpy_matrix
 from fgloc.recording.reader import open_recording

@@ -1,0 +1,112 @@
+"""State of the comparison of a recording's signals: what they are, and what was found so far."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from fgloc.config import Config, Role, WheelsConfig, one_line, setting, with_value
+from fgloc.diagnosis.handling import Handling
+from fgloc.diagnosis.landmark_fits import Noise
+from fgloc.diagnosis.pairs import Figure
+from fgloc.diagnosis.signals import Signals
+from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
+
+WHEELS: dict[str, Role] = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
+_UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
+_UNIT = 0.04  # logarithm by which a scale may miss a unit's
+
+
+def unit_of(scale: float, within: float = _UNIT) -> tuple[float, str] | None:
+    """Factor and name of the unit of length that a scale (true over reported) is near; None: no usual one."""
+    units = _UNITS | {1.0 / factor: f"metres for {name}" for factor, name in _UNITS.items()}
+    factor = min(units, key=lambda unit: abs(math.log(abs(scale) / unit)))
+    return (factor, units[factor]) if abs(math.log(abs(scale) / factor)) < within else None
+
+
+@dataclass
+class Conventions:
+    """Findings on the conventions of a recording, the configuration with their lines set, and the evidence.
+
+    Attributes:
+        config: as configured, then with the lines of the findings.
+        signals: of the recording; what passed while a person had the robot in hand is removed once that is found.
+        T_base_sensor: ``(4, 4)`` place of the sensor that reports ranges or marker poses; None: the base.
+        imu_up: ``(3,)`` the base's z axis in the IMU's frame, as configured; None: z.
+        landmark_map: None: nothing is compared with a map.
+        findings: with the lines that undo them.
+        compared: sentences on the pairs that were compared and agree, for `init`'s comments.
+        noise: of the sensor of landmarks, where its axes are right; no finding, but a better start than the defaults.
+        handling: when a person had the robot in hand; nothing is compared there.
+        opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
+        commanded: whether commands stand in for wheels.
+        wheels: with which the wheels' path was read; what is found since then is not in it.
+    """
+
+    config: Config
+    signals: Signals
+    T_base_sensor: FloatArray | None = None
+    imu_up: FloatArray | None = None
+    landmark_map: LandmarkMap | None = None
+    findings: list[Finding] = field(default_factory=list)
+    compared: list[str] = field(default_factory=list)
+    noise: Noise | None = None
+    handling: Handling = field(default_factory=Handling)
+    opposite: bool = False
+    commanded: bool = False
+    wheels: WheelsConfig = field(default_factory=WheelsConfig)
+
+    @property
+    def up(self) -> FloatArray:
+        """Unit vector ``(3,)`` of the base's z axis in the IMU's frame, as configured."""
+        axis = np.array([0.0, 0.0, 1.0]) if self.imu_up is None else np.asarray(self.imu_up, dtype=float)
+        return np.asarray(axis / max(float(np.linalg.norm(axis)), 1e-12))
+
+    @property
+    def places(self) -> dict[int, FloatArray]:
+        """Places ``(2,)`` of the map's landmarks [m], by id; empty: there is no map."""
+        known = {} if self.landmark_map is None else self.landmark_map.landmarks
+        return {i: landmark.position[:2] for i, landmark in known.items()}
+
+    @property
+    def codes(self) -> set[str]:
+        """Codes of the findings so far."""
+        return {finding.code for finding in self.findings}
+
+    def earlier(self, role: str, late_s: float) -> dict[str, Any]:
+        """Line that makes the stamps of a role earlier by so much."""
+        given = {str(r): offset for r, offset in self.config.recording.stamp_offset_s.items()}.get(role, 0.0)
+        return {"recording.stamp_offset_s": {role: round(given - late_s, 3)}}
+
+    def exchanged_joints(self) -> dict[str, Any]:
+        """Lines that exchange the joints of left and right wheel; empty: they have no names."""
+        wheels = self.config.wheels
+        exchanged = {"wheels.left_joint": wheels.right_joint, "wheels.right_joint": wheels.left_joint}
+        return exchanged if all(exchanged.values()) else {}
+
+    def trial(self) -> Conventions:
+        """A comparison of the same signals whose findings do not count yet."""
+        return replace(self, findings=[], compared=[])
+
+    def add(
+        self,
+        code: str,
+        text: str,
+        lines: Mapping[str, Any] | None = None,
+        figure: Figure | None = None,
+        severity: Severity = Severity.ERROR,
+    ) -> None:
+        """Note a finding, and set its lines."""
+        lines = lines or {}
+        shown = {setting(key): one_line(value) for key, value in lines.items()}
+        value, sigma = (None, None) if figure is None else (figure.value, figure.sigma)
+        remedy = "; ".join(f"set {key}: {value}" for key, value in shown.items())
+        self.findings.append(Finding(code, f"{text}{': ' + remedy if remedy else ''}.", severity, shown, value, sigma))
+        for key, given in lines.items():
+            with suppress(ValueError):  # beyond what a setting may be: it is said, and left as it is
+                self.config = with_value(self.config, key, given)

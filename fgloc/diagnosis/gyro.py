@@ -1,0 +1,178 @@
+"""The IMU against the wheels: axis, sign, unit, gravity, and the times in which a person had the robot in hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fgloc.diagnosis.comparison import Conventions
+from fgloc.diagnosis.handling import Span, cut, handling, outside
+from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit, fit_rate
+from fgloc.diagnosis.signals import Path, turn_by
+from fgloc.frames import rotation_of, sensor_pose
+from fgloc.types import FloatArray, Severity
+
+_SHARED = 0.9  # share of a turn that another explains: one measurement
+_GRAVITY = 5.0  # m/s²: less is no accelerometer
+_TILTED_RAD = 0.5  # of gravity from the IMU's upward axis: no careful mounting, and no slope
+_GRAVITY_SIZE = 9.81  # m/s²; 9.78 to 9.83 on Earth
+_GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is off, and beyond which its unit is
+
+
+def by_odometry(found: Conventions, path: Path) -> RateFit | None:
+    """Compare the gyro with an odometry whose yaw is the gyro's, where the wheels' angles do not tell its turns."""
+    driver, rates = found.signals.odometry_path(), found.signals.rates()
+    if path.source != "ticks" or driver is None or rates is None:
+        return None
+    by_angles = [fit_rate(path, rates[0], turn_by(rates[0], rate)) for rate in rates[1].T]
+    if any(fit is not None and fit.share > TELLS for fit in by_angles):
+        return None
+    trial = found.trial()
+    fit = check_gyro(trial, driver)
+    if fit is None or fit.share < _SHARED:
+        return None
+    found.findings += trial.findings
+    found.config = trial.config
+    return fit
+
+
+def by_hand(found: Conventions, path: Path) -> Path:
+    """Report when the robot was held, lifted or turned by hand, and cut that time from the signals and the path."""
+    trial = found.trial()
+    check_gyro(trial, path)
+    if trial.codes & {"imu.axes", "imu.gravity"}:
+        return path  # what turns is not what tilts
+    in_hand = handling(found.signals, trial.config, path, found.up * abs(trial.config.gyro.scale))
+    if sum(b - a for a, b in in_hand.spans) > 0.5 * (path.times[-1] - path.times[0]):
+        return path  # no robot is in hands for most of a drive: the gyro's unit or axes are wrong
+    found.handling = in_hand
+    for code, what, spans in (
+        ("held", "The robot was held, or its wheels spun: they turn more than the gyro from ", in_hand.held),
+        ("lifted", "The robot was lifted or turned by hand, by gyro and accelerometer, from ", in_hand.lifted),
+    ):
+        if spans:
+            found.add(f"motion.{code}", f"{what}{_text(spans)}", None, Figure(spans[0][0], 1.0), Severity.WARNING)
+    size = in_hand.gravity
+    if size is not None and _GRAVITY_OFF < abs(size / _GRAVITY_SIZE - 1.0) < _OTHER_UNIT:
+        text = (
+            f"The specific force at rest is {size:.2f} m/s², {abs(100.0 * (size / _GRAVITY_SIZE - 1.0)):.1f} % "
+            f"{'more' if size > _GRAVITY_SIZE else 'less'} than gravity: scale or bias of the accelerometer is off, "
+            "and tilts by it are as much in doubt"
+        )
+        found.add("imu.gravity_scale", text, None, Figure(size, 0.05), Severity.NOTE)
+    if not in_hand.spans:
+        return path
+    found.signals = outside(found.signals, in_hand)
+    return cut(path, in_hand)
+
+
+def _text(spans: Sequence[Span]) -> str:
+    return ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in spans)
+
+
+def check_gyro(found: Conventions, path: Path) -> RateFit | None:
+    """Compare axis, sign, unit and lag of the gyro; the fit of the axis that measures the turn, None: none does."""
+    rates = found.signals.rates()
+    if rates is None:
+        return None
+    times, omega, force = rates
+    turned = np.column_stack([turn_by(times, rate) for rate in omega.T])
+    given = found.config.gyro.scale
+    sign = math.copysign(1.0, given)
+    up = found.up * (sign if found.imu_up is None else 1.0)  # a mounting has the sign of the scale in it
+    configured = fit_rate(path, times, turned @ up * abs(given))
+    gravity = _gravity_axis(force)
+    if configured is not None and configured.share > TELLS and configured.scale.value > 0.0:
+        check_gravity(found, force, up * sign)
+        return _check_scale(found, configured)
+    if configured is not None and configured.share > TELLS and gravity is not None and gravity @ up * sign > 0.5:
+        found.opposite = True  # the IMU stands upright: wheels or gyro count the other way
+        return replace(configured, scale=replace(configured.scale, value=-configured.scale.value))
+    fits = {k: fit for k in range(3) if (fit := fit_rate(path, times, turned[:, k])) is not None and fit.share > TELLS}
+    if not fits:
+        check_gravity(found, force, up * sign)
+        return None
+    k = max(fits, key=lambda i: fits[i].share + (0.1 if gravity is not None and abs(gravity[i]) > 0.85 else 0.0))
+    axis = np.zeros(3)
+    axis[k] = math.copysign(1.0, fits[k].scale.value)
+    _set_axis(found, axis, gravity, fits[k])
+    again = fit_rate(path, times, turned @ axis * abs(found.config.gyro.scale))
+    return None if again is None else _check_scale(found, again)
+
+
+def _set_axis(found: Conventions, axis: FloatArray, gravity: FloatArray | None, fit: RateFit) -> None:
+    """Name the axis of the IMU that points up, and set it."""
+    scale = found.config.gyro.scale
+    by_gravity = "" if gravity is None else f", and gravity lies along {_named(gravity)}"
+    text = (
+        f"The turn of the wheels is the gyro's {_named(axis)} axis, not the one that its mounting says (it explains "
+        f"{100.0 * fit.share:.0f} % of the wheels' turn{by_gravity})"
+    )
+    lines: dict[str, Any] = {"recording.imu_pose": _pose_for(axis)}
+    if gravity is not None and gravity @ axis < -0.5:  # a mirror: no turn of the IMU does both
+        lines = {"recording.imu_pose": _pose_for(-axis), "gyro.scale": -abs(scale)}
+        text += "; gravity has the opposite sign, as of left-handed axes"
+    elif scale < 0.0:
+        lines["gyro.scale"] = -scale
+    found.add("imu.axes", text, lines)
+
+
+def _pose_for(up: FloatArray) -> list[float]:
+    """``recording.imu_pose`` of an IMU whose axis ``up (3,)`` points upwards, by the least turn."""
+    across = np.cross(up, [0.0, 0.0, 1.0])
+    size = float(np.linalg.norm(across))
+    T = np.eye(4)
+    T[:3, :3] = rotation_of(math.atan2(size, float(up[2])) * (across / size if size > 1e-9 else np.eye(3)[0]))
+    return [0.0, 0.0, 0.0, *(round(v, 4) + 0.0 for v in sensor_pose(T, optical=False)[3:])]
+
+
+def _gravity_axis(force: FloatArray) -> FloatArray | None:
+    mean = np.median(force, axis=0)
+    size = float(np.linalg.norm(mean))
+    return None if not size > _GRAVITY else np.asarray(mean / size)
+
+
+def check_gravity(found: Conventions, force: FloatArray, up: FloatArray) -> None:
+    """Report an IMU that is not upright by its accelerometer, although its gyro agrees or measures no turn."""
+    axis = _gravity_axis(force)
+    if axis is None or math.acos(float(np.clip(axis @ up, -1.0, 1.0))) < _TILTED_RAD:
+        return
+    k, snapped = int(np.argmax(np.abs(axis))), np.zeros(3)
+    snapped[k] = math.copysign(1.0, axis[k])
+    if float(axis @ snapped) < math.cos(_TILTED_RAD):
+        snapped = axis
+    text = f"The IMU's accelerometer has gravity along {_named(axis)}, not along the axis that its mounting says"
+    found.add("imu.gravity", text, {"recording.imu_pose": _pose_for(snapped)})
+
+
+def _named(axis: FloatArray) -> str:
+    k = int(np.argmax(np.abs(axis)))
+    named = f"{'-' if axis[k] < 0 else ''}{'xyz'[k]}"
+    return named if abs(axis[k]) > 0.9 else f"({', '.join(f'{v:.2f}' for v in axis)})"
+
+
+def _check_scale(found: Conventions, fit: RateFit) -> RateFit:
+    """Name a gyro in degrees, or a track that the turn refutes."""
+    factor = fit.scale.value  # wheels' turn over the gyro's as configured
+    log, degrees = math.log(max(factor, 1e-9)), math.pi / 180.0
+    omega = found.config.wheels.scale_omega
+    if abs(log - math.log(degrees)) < ROUGHLY:
+        text = f"The gyro's rates are in degrees: they are {1.0 / factor:.1f} times those of the wheels"
+        found.add("imu.unit", text, {"gyro.scale": round(found.config.gyro.scale * degrees, 7)}, fit.scale)
+    elif abs(log + math.log(degrees)) < ROUGHLY:
+        text = f"The wheels' yaw rate is {factor:.1f} times the gyro's: it is in degrees"
+        found.add("odometry.yaw_unit", text, {"wheels.scale_omega": round(omega * degrees, 7)}, fit.scale)
+    elif fit.scale.off(1.0, RATE_SCALE):
+        text = (
+            f"The wheels turn {factor:.3f} ± {fit.scale.sigma:.3f} times as much as the gyro (a track as the turn sees "
+            "it, or skidding wheels; a gyro is seldom off by so much)"
+        )
+        share = Figure(1.0 / factor, fit.scale.sigma / factor**2)
+        found.add("wheels.turn", text, {"wheels.scale_omega": round(omega / factor, 4)}, share)
+    else:
+        found.compared.append(f"gyro and wheels turn alike ({factor:.3f} ± {fit.scale.sigma:.3f})")
+    return fit
