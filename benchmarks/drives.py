@@ -10,8 +10,8 @@ The bags are those of `benchmarks.field_recordings`, in their owners' units. A r
   whole recording, as the fit that it is compared with was: the largest difference of a parameter from that fit, in our
   sigmas. ``.half.ate_m``: calibrated on the first half, reported on the second. ``.nominal.ate_m``: the guesses.
 
-Further rows are those of `benchmarks.drives_radio` (ranges and positions) and `benchmarks.drives_odometry` (a second
-odometry), which say themselves what was chosen on which data.
+Further rows are those of `benchmarks.drives_radio` (ranges and positions), `benchmarks.drives_odometry` (a second
+odometry) and `benchmarks.drives_sim` (``sim.*``: simulated robots), which say themselves what was chosen on which data.
 
 ATE is the rmse of positions, the truth's frame fitted by a rigid motion. The length of the
 calibration's windows was chosen on the whole tricycle (its parameters are 3.8 sigmas from that fit with 2 s in place of 4 s),
@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import drives_odometry, drives_radio
+from benchmarks import drives_odometry, drives_radio, drives_sim
 from benchmarks.common import Row, main, not_run
 from benchmarks.field_recordings import DATA, RECORDINGS, Recording, mecanum, tricycle
 from fgloc.calibrate import calibrate
@@ -93,6 +93,7 @@ def measure(quick: bool) -> Iterator[Row]:
             yield from _tricycle(Path(scratch), quick)
     yield from drives_radio.measure(quick)
     yield from drives_odometry.measure(quick)
+    yield from drives_sim.measure(quick)
 
 
 def _mecanum(scratch: Path, quick: bool) -> Iterator[Row]:

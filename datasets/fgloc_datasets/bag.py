@@ -264,11 +264,27 @@ class BagWriter(LandmarkMessages):
     """
 
     def command(
-        self, topic: str, stamp_ns: int, v: float, omega: float, received_ns: int | None = None, frame_id: str = ""
+        self,
+        topic: str,
+        stamp_ns: int,
+        v: float,
+        omega: float,
+        received_ns: int | None = None,
+        frame_id: str = "",
+        vy: float = 0.0,
     ) -> None:
-        """``geometry_msgs/TwistStamped``: v [m/s], omega [rad/s]."""
-        twist = self._twist([v, 0.0, 0.0], [0.0, 0.0, omega])
+        """``geometry_msgs/TwistStamped``: v [m/s], omega [rad/s], vy [m/s] to the left."""
+        twist = self._twist([v, vy, 0.0], [0.0, 0.0, omega])
         self._write(topic, "geometry_msgs/msg/TwistStamped", stamp_ns, received_ns, frame_id, dict(twist=twist))
+
+    def ackermann(
+        self, topic: str, stamp_ns: int, speed: float, steering: float, received_ns: int | None = None
+    ) -> None:
+        """``ackermann_msgs/AckermannDriveStamped``: speed [m/s] and steering angle [rad]."""
+        fields = dict(steering_angle=steering, steering_angle_velocity=0.0, speed=speed, acceleration=0.0, jerk=0.0)
+        drive = self._make("ackermann_msgs/msg/AckermannDrive", **fields)
+        kind = "ackermann_msgs/msg/AckermannDriveStamped"
+        self._write(topic, kind, stamp_ns, received_ns, "base_link", dict(drive=drive))
 
     def odometry(
         self,

@@ -152,7 +152,8 @@ def key_in_file(key: str, model: type[Section]) -> str:
     inner = model
     for part in outer:
         section = section_of(inner.model_fields[part])
-        assert section is not None
+        if section is None:  # one of several sections, such as a drive, whose keys are all the user's
+            return key
         inner = section
     field = inner.model_fields[last]
     while (section := section_of(field)) is not None:  # of a section the first value

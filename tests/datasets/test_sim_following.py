@@ -21,7 +21,8 @@ from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import LandmarkMap
 from fgloc_datasets.bag import BagWriter
-from fgloc_datasets.sim.control import Command, Driver
+from fgloc_datasets.sim.control import Driver
+from fgloc_datasets.sim.drives import Command
 from fgloc_datasets.sim.following.cases import CASES, draw_drives, drive_of, table
 from fgloc_datasets.sim.following.loop import (
     PROCESSING_S,

@@ -157,8 +157,8 @@ def test_the_robot_has_the_true_wheels_and_believes_the_others() -> None:
     turned = base_twist(log)[steady, 2].mean()
     assert abs(turned) > 0.2
     assert not slipping(log, true).any()
-    np.testing.assert_allclose(wheel_twist(log, true)[steady, 1].mean(), turned, rtol=0.005)
-    said = odometry(log, true, 4)[1][log.stamps_s[::4] > 3.0, 1].mean()
+    np.testing.assert_allclose(wheel_twist(log, true)[steady, 2].mean(), turned, rtol=0.005)
+    said = odometry(log, true, 4)[1][log.stamps_s[::4] > 3.0, 2].mean()
     left, right = log.wheel_rates[steady].mean(axis=0) * robot.radius_m  # by the radius and the track that are believed
     assert said == pytest.approx((right - left) / (robot.track_m * robot.track_scale), rel=0.005)
     assert abs(said / turned - 1.0) > 0.02

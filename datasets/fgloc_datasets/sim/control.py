@@ -10,10 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fgloc_datasets.sim.drives import Command, as_driven
 from fgloc_datasets.sim.scenario import Control, ControlKind, Robot, Scenario, channel_rng
 
-Command = tuple[float, float]  # v [m/s], ω [rad/s]
-Function = Callable[[float], Command]  # of the time within the segment [s]
+Wanted = tuple[float, float]  # speed [m/s], turn [rad/s]
+Function = Callable[[float], Wanted]  # of the time within the segment [s]
 
 
 def make_function(kind: ControlKind, robot: Robot, length_s: float, rng: np.random.Generator) -> Function:
@@ -47,7 +48,7 @@ def make_function(kind: ControlKind, robot: Robot, length_s: float, rng: np.rand
         turns = [float(x) for x in rng.uniform(-0.8, 0.8, 64) * w_max]
         v_go = max(v, 0.6 * v_max)
 
-        def stop_and_go(t: float) -> Command:
+        def stop_and_go(t: float) -> Wanted:
             cycle, phase = divmod(t, go + rest)
             return (v_go, 0.6 * turns[int(cycle) % 64]) if phase < go else (0.0, 0.0)
 
@@ -64,8 +65,9 @@ def make_function(kind: ControlKind, robot: Robot, length_s: float, rng: np.rand
 class Driver:
     """Commands of the robot over time; near walls it is turned back.
 
-    The control function is open loop. Near a wall, and only while heading for it, the driver takes over, turns towards
-    the middle of the room and gives back control: the recorded commands are those that were sent.
+    A robot that goes sideways changes its direction slowly, as drawn by the seed. The control function is open loop.
+    Near a wall, and only while heading for it, the driver takes over, turns towards the middle of the room and gives
+    back control: the recorded commands are those that were sent.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
@@ -80,21 +82,28 @@ class Driver:
         ]
         self._next_waypoint = 0
         self._turning_back = False
+        self._steering = 0.0
+        rng = channel_rng(seed, "sideways")
+        self._aside = [(float(rng.uniform(0.04, 0.12)), float(rng.uniform(0.0, math.tau))) for _ in range(2)]
 
     def command(self, t: float, pose: tuple[float, float, float]) -> Command:
         """Command at time t [s] of a robot at x, y [m], yaw [rad]; to be asked in order of time."""
         if t < self._control.rest_s:
-            return 0.0, 0.0
+            return Command(0.0, 0.0)
+        aside = 0.0  # direction of the motion from straight ahead [rad]
         if self._control.waypoints:
             v, omega = self._to_waypoint(self._control, pose)
         else:
             index = min(int(t / self._control.segment_s), len(self._functions) - 1)
             v, omega = self._functions[index](t - index * self._control.segment_s)
-            v, omega = self._keep_inside(pose, v, omega)
-        limit = self._robot
-        return min(max(v, -limit.max_v), limit.max_v), min(max(omega, -limit.max_omega), limit.max_omega)
+            if self._robot.kind == "mecanum":
+                aside = sum(0.5 * _WIDEST * math.sin(math.tau * hz * t + phase) for hz, phase in self._aside)
+            v, omega = self._keep_inside((pose[0], pose[1], pose[2] + aside), v, omega)
+        command = as_driven(self._robot, v * math.cos(aside), omega, v * math.sin(aside), self._steering)
+        self._steering = command.steering
+        return command
 
-    def _to_waypoint(self, control: Control, pose: tuple[float, float, float]) -> Command:
+    def _to_waypoint(self, control: Control, pose: tuple[float, float, float]) -> Wanted:
         target = control.waypoints[self._next_waypoint % len(control.waypoints)]
         if math.hypot(target[0] - pose[0], target[1] - pose[1]) < 0.25:
             self._next_waypoint += 1
@@ -102,7 +111,7 @@ class Driver:
         off = _bearing(pose, target)
         return control.speed * max(0.15, math.cos(off)) if abs(off) < 1.3 else 0.0, 1.6 * off
 
-    def _keep_inside(self, pose: tuple[float, float, float], v: float, omega: float) -> Command:
+    def _keep_inside(self, pose: tuple[float, float, float], v: float, omega: float) -> Wanted:
         x, y, yaw = pose
         ahead = 0.35
         reach_x, reach_y = self._reach
@@ -116,6 +125,9 @@ class Driver:
             return v, omega
         turn = max(0.5, min(1.0, abs(off))) * math.copysign(0.7 * self._robot.max_omega, off)
         return (0.15 * self._robot.max_v if abs(off) < 1.2 else 0.0), turn
+
+
+_WIDEST = 2.0  # rad: the most that a robot which goes sideways goes aside from straight ahead
 
 
 def _bearing(pose: tuple[float, float, float], target: tuple[float, float]) -> float:

@@ -6,6 +6,7 @@ themselves other than written. So the same seed renders the same walls and image
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from fgloc_datasets.sim.scenario import Camera, Installation, Robot, Scenario, S
 from fgloc_datasets.sim.scene import intrinsics, optical_rotation
 
 INSTALLED = "installed.yaml"
+_WITH_WHEELBASE = ("ackermann", "mecanum")  # skid-steer robots have one that nobody needs
 
 
 class MountedCamera(Section):
@@ -49,12 +51,21 @@ class TrueCamera(MountedCamera):
     time_offset_s: float = 0.0  # stamp minus the middle of the exposure, on average
 
 
+class Steering(Section):
+    """Steering of an Ackermann robot: true angles are ``ratio`` times the reported ones, and ``zero_rad`` besides."""
+
+    zero_rad: float = 0.0
+    ratio: float = 1.0
+
+
 class Wheels(Section):
-    """Radii and track [m]."""
+    """Radii and track [m]; wheelbase [m] and steering of robots that have them."""
 
     left_radius: float
     right_radius: float
     track: float
+    wheelbase: float | None = None
+    steering: Steering | None = None
 
 
 class TrueWheels(Wheels):
@@ -140,20 +151,30 @@ def install(scenario: Scenario, seed: int, landmarks: LandmarkMap) -> Installed:
         map=TrueMap(landmarks=tuple(_marker(landmark) for landmark in landmarks.landmarks.values())),
         believed=Believed(
             camera=believed,
-            wheels=Wheels(left_radius=robot.radius_m, right_radius=robot.radius_m, track=robot.track_m),
+            wheels=Wheels(
+                left_radius=robot.radius_m,
+                right_radius=robot.radius_m,
+                track=robot.track_m,
+                wheelbase=robot.wheelbase_m if robot.kind in _WITH_WHEELBASE else None,
+                steering=Steering() if robot.kind == "ackermann" else None,
+            ),
         ),
     )
 
 
 def true_robot(robot: Robot, wheels: Wheels) -> Robot:
     """The robot with the wheels that it really has; what its regulator and odometry believe does not change."""
-    return robot.model_copy(
-        update={
-            "radius_scale": (wheels.left_radius / robot.radius_m, wheels.right_radius / robot.radius_m),
-            "track_m": wheels.track,
-            "track_scale": robot.track_scale * robot.track_m / wheels.track,
-        }
-    )
+    update = {
+        "radius_scale": (wheels.left_radius / robot.radius_m, wheels.right_radius / robot.radius_m),
+        "track_m": wheels.track,
+        "track_scale": robot.track_scale * robot.track_m / wheels.track,
+    }
+    if wheels.wheelbase is not None:
+        update |= {"wheelbase_m": wheels.wheelbase}
+        update |= {"wheelbase_scale": robot.wheelbase_scale * robot.wheelbase_m / wheels.wheelbase}
+    if wheels.steering is not None:
+        update |= {"steering_zero_rad": wheels.steering.zero_rad, "steering_ratio": wheels.steering.ratio}
+    return robot.model_copy(update=update)
 
 
 def survey(installation: Installation | None, seed: int, landmarks: LandmarkMap) -> LandmarkMap:
@@ -180,6 +201,10 @@ def write_installed(installed: Installed, path: Path) -> None:
     """Write ``installed.yaml``."""
     note = "# The truth of the installation, for evaluation only: no program that localises reads it.\n"
     content = installed.model_dump(mode="json")
+    for told in (content["wheels"], content["believed"]["wheels"]):
+        for name in ("wheelbase", "steering"):
+            if told[name] is None:  # the robot has none
+                del told[name]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
     path.write_text(note + text, encoding="utf-8")
 
@@ -223,10 +248,19 @@ def _true_wheels(robot: Robot, seed: int, errors: Installation) -> TrueWheels:
     common = 1.0 + _uniform(seed, errors, "wheel_radius_share")
     difference = _uniform(seed, errors, "wheel_difference_share")
     left, right = (robot.radius_m * scale * common for scale in robot.radius_scale)
+    steering = None
+    if robot.kind == "ackermann":
+        steering = Steering(
+            zero_rad=robot.steering_zero_rad + math.radians(_uniform(seed, errors, "steering_zero_deg")),
+            ratio=robot.steering_ratio * (1.0 + _uniform(seed, errors, "steering_share")),
+        )
+    longer = 1.0 + _uniform(seed, errors, "wheelbase_share")
     return TrueWheels(
         left_radius=left * (1.0 + 0.5 * difference),
         right_radius=right * (1.0 - 0.5 * difference),
         track=robot.track_m * (1.0 + _uniform(seed, errors, "track_share")),
+        wheelbase=robot.wheelbase_m * longer if robot.kind in _WITH_WHEELBASE else None,
+        steering=steering,
         time_offset_s=_uniform(seed, errors, "wheel_time_s"),
     )
 

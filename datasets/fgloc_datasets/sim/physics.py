@@ -14,13 +14,25 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from fgloc.drives.sides import SkidSteer
 from fgloc.errors import FglocError
 from fgloc.frames import yaw_quaternion
 from fgloc.types import FloatArray, LandmarkMap
-from fgloc_datasets.sim.control import Command, Driver
+from fgloc_datasets.sim.control import Driver
+from fgloc_datasets.sim.drives import (
+    Command,
+    rolled,
+    rows,
+    steering_angles,
+    steering_names,
+    true,
+    twists,
+    wheel_names,
+    wheels,
+)
 from fgloc_datasets.sim.installed import Installed, install, survey, true_robot
 from fgloc_datasets.sim.scenario import Robot, Scenario
-from fgloc_datasets.sim.scene import Ground, build_model, make_ground, make_map, wheel_names
+from fgloc_datasets.sim.scene import Ground, build_model, make_ground, make_map
 
 TICK_S = 0.005
 _SETTLE_S = 0.5
@@ -34,7 +46,7 @@ class SimulationError(FglocError):
 
 @dataclass(slots=True, eq=False)
 class Log:
-    """State of the robot every TICK_S, from time 0 on. The base frame is on the floor between the wheels.
+    """State of the robot every TICK_S, from time 0 on. The base frame is on the floor (`Robot`); wheels: driven ones.
 
     While the robot drives, the first ``ticks`` rows are filled; times are known from the start.
     """
@@ -47,7 +59,8 @@ class Log:
     wheel_angles: FloatArray  # (n, wheels) rad
     wheel_rates: FloatArray  # (n, wheels) rad/s
     torques: FloatArray  # (n, wheels) Nm, at the wheel
-    commands: FloatArray  # (m, 3) t [s], v [m/s], omega [rad/s]
+    steering: FloatArray  # (n, k) rad, as the steering reports it
+    commands: FloatArray  # (m, 5) t [s] and the fields of `Command`
     ticks: int
 
     def part(self, rows: slice) -> Log:
@@ -65,6 +78,7 @@ _PER_TICK = (
     "wheel_angles",
     "wheel_rates",
     "torques",
+    "steering",
 )
 
 
@@ -122,15 +136,16 @@ class Simulation:
         self._names = wheel_names(robot)
         joints = [model.joint(name).id for name in self._names]
         self._wheel_q, self._wheel_v = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        self._steering_q = model.jnt_qposadr[[model.joint(name).id for name in steering_names(robot)]]
         qpos = self._data.qpos
         qpos[:2] = scenario.start[:2]
         qpos[2] = scene.ground.height_at(*scenario.start[:2], reach_m=0.2)
         qpos[3:7] = np.roll(yaw_quaternion(scenario.start[2]), 1)
         self._regulator = Regulator(robot)
         self._every_command = round(1.0 / scenario.rates.command / TICK_S)
-        n, wheels = round(scenario.duration_s / TICK_S) + 1, len(self._names)
+        n, driven = round(scenario.duration_s / TICK_S) + 1, len(self._names)
         self._q, self._v = np.empty((n, model.nq)), np.empty((n, model.nv))
-        commands = np.zeros((-(-n // self._every_command), 3))
+        commands = np.zeros((-(-n // self._every_command), 1 + len(Command._fields)))
         commands[:, 0] = [tick * TICK_S for tick in range(0, n, self._every_command)]
         self.log = Log(
             stamps_s=np.arange(n) * TICK_S,
@@ -138,9 +153,10 @@ class Simulation:
             quaternions=np.empty((n, 4)),
             velocities=self._v[:, :3],
             rates=self._v[:, 3:6],
-            wheel_angles=np.empty((n, wheels)),
-            wheel_rates=np.empty((n, wheels)),
-            torques=np.empty((n, wheels)),
+            wheel_angles=np.empty((n, driven)),
+            wheel_rates=np.empty((n, driven)),
+            torques=np.empty((n, driven)),
+            steering=np.empty((n, len(self._steering_q))),
             commands=commands,
             ticks=0,
         )
@@ -155,8 +171,8 @@ class Simulation:
         substeps = round(TICK_S / robot.contact.timestep_s)
         every_regulation = round(1.0 / robot.motor.regulator_hz / TICK_S)
         delay = round(robot.command_delay_s / TICK_S)
-        delayed: deque[tuple[int, float, float]] = deque()
-        set_point = (0.0, 0.0)
+        delayed: deque[tuple[int, Command]] = deque()
+        set_point = Command(0.0, 0.0)
         tyres = self._tyres()
         for tick in range(-round(_SETTLE_S / TICK_S), len(self._q)):
             if tick >= 0:
@@ -166,13 +182,15 @@ class Simulation:
                     if wanted is None:
                         break
                     self.log.commands[tick // self._every_command, 1:] = wanted
-                    delayed.append((tick + delay, *wanted))
+                    delayed.append((tick + delay, wanted))
                 while delayed and delayed[0][0] <= tick:
-                    set_point = delayed.popleft()[1:]
+                    set_point = delayed.popleft()[1]
             if tick % every_regulation == 0:
                 self._regulate(tick, set_point)
-            for friction, place in tyres:  # that of the floor under each wheel
-                friction[0] = scene.ground.mu_at(place[0], place[1])
+            for frictions, place in tyres:  # that of the floor under each wheel
+                mu = scene.ground.mu_at(place[0], place[1])
+                for friction in frictions:
+                    friction[0] = mu
             mujoco.mj_step(scene.model, data, nstep=substeps)
         q, v = self._q[: self.log.ticks], self._v[: self.log.ticks]
         if not (np.isfinite(q).all() and np.abs(v).max() < _DIVERGED):
@@ -180,10 +198,16 @@ class Simulation:
             raise SimulationError(f"{name}, seed {scene.seed}: the physics diverged; use a smaller timestep_s")
         return self.log
 
-    def _tyres(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Friction and place of each wheel's geometry, as MuJoCo holds them."""
-        ids = [self._scene.model.geom(n.removesuffix("_joint")).id for n in self._names]
-        return [(self._scene.model.geom_friction[i], self._data.geom_xpos[i]) for i in ids]
+    def _tyres(self) -> list[tuple[list[FloatArray], FloatArray]]:
+        """Frictions of each wheel's tyre or rollers, and its place, as MuJoCo holds them."""
+        model = self._scene.model
+        named = {model.geom(i).name: i for i in range(model.ngeom)}
+        out = []
+        for wheel in wheels(self._scene.scenario.robot):
+            name = wheel.joint.removesuffix("_joint")
+            touching = [i for n, i in named.items() if n.startswith(f"{name}_roller")] or [named[name]]
+            out.append(([model.geom_friction[i] for i in touching], self._data.geom_xpos[named[name]]))
+        return out
 
     def _record(self, tick: int) -> None:
         data, log = self._data, self.log
@@ -191,43 +215,60 @@ class Simulation:
         log.quaternions[tick, :3], log.quaternions[tick, 3] = data.qpos[4:7], data.qpos[3]
         log.wheel_angles[tick], log.wheel_rates[tick] = data.qpos[self._wheel_q], data.qvel[self._wheel_v]
         log.torques[tick] = data.actuator_force[: len(self._names)]
+        robot = self._scene.scenario.robot
+        log.steering[tick] = (data.qpos[self._steering_q] - robot.steering_zero_rad) / robot.steering_ratio
         log.ticks = tick + 1
 
     def _regulate(self, tick: int, set_point: Command) -> None:
-        payload, ctrl = self._scene.scenario.robot.payload, self._data.ctrl
-        ctrl[: len(self._names)] = self._regulator.volts(set_point, self._data.qpos[self._wheel_q].tolist())
+        robot, payload, ctrl = self._scene.scenario.robot, self._scene.scenario.robot.payload, self._data.ctrl
+        driven = len(self._names)
+        ctrl[:driven] = self._regulator.volts(set_point, self._data.qpos[self._wheel_q].tolist())
+        for i, angle in enumerate(self._regulator.steering):
+            ctrl[driven + i] = robot.steering_zero_rad + robot.steering_ratio * angle
         if payload is not None:
             moved = tick * TICK_S > payload.shift_at_s
             ctrl[-1] = math.dist(payload.start, payload.end) if moved else 0.0
 
 
 class Regulator:
-    """The speed regulator of all wheels: PI on encoder speeds, slew-limited set point."""
+    """The regulator of all wheels: PI on encoder speeds, slew-limited set point.
+
+    Attributes:
+        steering: set points of the steering [rad], left and right; empty if there is none.
+    """
 
     def __init__(self, robot: Robot) -> None:
         """Start at rest."""
         self._robot = robot
-        self._sides = [-1.0 if "left" in name else 1.0 for name in wheel_names(robot)]
+        self._rows = rows(robot)
+        self.steering = steering_angles(robot, 0.0)
         self._dt = 1.0 / robot.motor.regulator_hz
         self._per_rad = robot.ticks_per_turn / (2.0 * math.pi)
         self._ticks: list[int] | None = None
-        self._integrals = [0.0] * len(self._sides)
-        self._v = self._omega = 0.0
+        self._integrals = [0.0] * len(self._rows)
+        self._v = self._omega = self._vy = self._angle = 0.0
 
-    def volts(self, set_point: tuple[float, float], angles: list[float]) -> list[float]:
-        """Motor voltages for a set point (v, ω) and the wheels' angles [rad] now."""
+    def volts(self, set_point: Command, angles: list[float]) -> list[float]:
+        """Motor voltages for a set point and the wheels' angles [rad] now."""
         robot, motor, dt = self._robot, self._robot.motor, self._dt
-        self._v = _slew(self._v, set_point[0], robot.max_acceleration * dt)
-        self._omega = _slew(self._omega, set_point[1], robot.max_angular_acceleration * dt)
-        arm = 0.5 * robot.track_m * robot.track_scale
+        self._v = _slew(self._v, set_point.v, robot.max_acceleration * dt)
+        self._vy = _slew(self._vy, set_point.vy, robot.max_acceleration * dt)
+        if robot.kind == "ackermann":  # the wheels go as they are steered
+            self._angle = _slew(self._angle, set_point.steering, robot.steering_rad_s * dt)
+            self.steering = steering_angles(robot, self._angle)
+            self._omega = self._v * math.tan(self._angle) / (robot.wheelbase_m * robot.wheelbase_scale)
+        else:
+            self._omega = _slew(self._omega, set_point.omega, robot.max_angular_acceleration * dt)
         ticks = [math.floor(a * self._per_rad) for a in angles]
         before = ticks if self._ticks is None else self._ticks
         self._ticks = ticks
         supply = motor.supply_v
+        wanted = [(self._v + aside * self._vy + self._omega * arm) / robot.radius_m for aside, arm in self._rows]
+        errors = [wanted[i] - (ticks[i] - before[i]) / self._per_rad / dt for i in range(len(wanted))]
+        if robot.kind == "ackermann":  # a differential gear: both wheels are driven alike
+            errors = [sum(errors) / len(errors)] * len(errors)
         out = []
-        for i, side in enumerate(self._sides):
-            wanted = (self._v + side * self._omega * arm) / robot.radius_m
-            error = wanted - (ticks[i] - before[i]) / self._per_rad / dt
+        for i, error in enumerate(errors):
             self._integrals[i] = _clip(self._integrals[i] + motor.ki * error * dt, supply)
             out.append(_clip(motor.kp * error + self._integrals[i], supply))
         return out
@@ -250,18 +291,22 @@ def base_twist(log: Log) -> FloatArray:
 
 
 def wheel_twist(log: Log, robot: Robot) -> FloatArray:
-    """Body twist ``(n, 2)`` (v, ω) that the wheels' rates mean if no wheel slips, with their true radii."""
-    left = log.wheel_rates[:, 0::2].mean(axis=1) * robot.radius_m * robot.radius_scale[0]
-    right = log.wheel_rates[:, 1::2].mean(axis=1) * robot.radius_m * robot.radius_scale[1]
-    return np.column_stack([0.5 * (left + right), (right - left) / robot.track_m])
+    """Body twist ``(n, 3)`` vx, vy, ω that wheels and steering mean if no wheel slips, with their true geometry."""
+    return twists(robot, true(robot), robot.track_m, rolled(robot, log.wheel_rates), log.steering)
 
 
 def slipping(log: Log, robot: Robot) -> NDArray[np.bool_]:
     """Whether any wheel's circumference moves over the ground, ``(n,)``."""
-    difference = base_twist(log)[:, [0, 2]] - wheel_twist(log, robot)
-    turn = 0.5 * robot.track_m * difference[:, 1]
-    worst = np.maximum(np.abs(difference[:, 0] - turn), np.abs(difference[:, 0] + turn))
-    return np.asarray(worst > SLIP_M_S)
+    twist, drive = base_twist(log), true(robot)
+    if drive is None or isinstance(drive, SkidSteer):
+        difference = twist - wheel_twist(log, robot)
+        turn = 0.5 * robot.track_m * difference[:, 2]
+        worst = np.maximum(np.abs(difference[:, 0] - turn), np.abs(difference[:, 0] + turn))
+        return np.asarray(worst > SLIP_M_S)
+    rates = rolled(robot, log.wheel_rates)
+    made = [drive.equations(row, angles) for row, angles in zip(rates, log.steering, strict=True)]
+    over = np.array([np.abs(e.A @ true_twist - e.b).max() for e, true_twist in zip(made, twist, strict=True)])
+    return over > SLIP_M_S
 
 
 def _planar(qpos: FloatArray) -> tuple[float, float, float]:

@@ -25,11 +25,12 @@ from fgloc.instrumentation import counted
 from fgloc.sensors.maps import write_map
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import write_robot
+from fgloc_datasets.sim.drives import settings as drive_settings
+from fgloc_datasets.sim.drives import wheel_names
 from fgloc_datasets.sim.installed import INSTALLED, write_installed
 from fgloc_datasets.sim.physics import Scene, SimulationError, make_scene, simulate
 from fgloc_datasets.sim.scenario import Control, Scenario, Section
-from fgloc_datasets.sim.scene import wheel_names
-from fgloc_datasets.sim.sensors import gnss_settings, streams, uwb_settings
+from fgloc_datasets.sim.sensors import command_topic, gnss_settings, streams, uwb_settings
 
 # --- One run ----------------------------------------------------------------------------------------------------------
 
@@ -97,7 +98,17 @@ def describe(scenario: Scenario, seed: int, camera: bool) -> str:
 def _unused(scenario: Scenario) -> dict[str, Any]:
     """Options that were added later, where they are not used: older recordings stay what they are."""
     floor, markers = scenario.world.floor, scenario.world.markers
+    steers, has_wheelbase = scenario.robot.kind == "ackermann", scenario.robot.kind in ("ackermann", "mecanum")
     return {
+        "robot": {
+            *(set() if steers else {"steering_zero_rad", "steering_ratio", "max_steering_rad", "steering_rad_s"}),
+            *(set() if scenario.robot.kind == "mecanum" else {"rollers"}),
+            *(set() if has_wheelbase else {"wheelbase_scale"}),
+        },
+        "installation": {
+            *(set() if steers else {"steering_zero_deg", "steering_share"}),
+            *(set() if has_wheelbase else {"wheelbase_share"}),
+        },
         **{name: True for name in ("uwb", "gnss") if getattr(scenario, name) is None},
         "world": {
             "floor": {name for name in ("ramps", "tilt", "rough") if not getattr(floor, name)},
@@ -115,7 +126,7 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
         wheels = {"source": "ticks", "left_joint": left, "right_joint": right}
         wheels |= {"left_radius": robot.radius_m, "right_radius": robot.radius_m, "track": robot.track_m}
     else:
-        wheels = {"source": "twist"}
+        wheels = {"drive": drive_settings(robot)}
     wheels["noise"] = {
         "x_per_sqrt_m": 0.02,
         "y_per_sqrt_m": 0.01,
@@ -128,7 +139,7 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
     # Corners are good to 0.07 px at rest; what motion blur adds is in markers.blur_s. On validation recordings as
     # installed NEES/3 is 0.77 and 0.5 % of sound sightings are refused; with 0.09 px and no blur_s 3 %.
     markers = {"sigma_px": 0.1}
-    topics = {"command": "/cmd_vel", "odometry": "/odom", "truth": "/truth"}
+    topics = {"command": command_topic(robot), "odometry": "/odom", "truth": "/truth"}
     settings: dict[str, Any] = {"recording": {"topics": topics}, "wheels": wheels, "markers": markers}
     if scenario.world.floor.uneven:
         settings["estimator"] = {"ground": "uneven"}

@@ -146,6 +146,9 @@ class Installation(Section):
     wheel_radius_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform, both wheels: true over believed
     wheel_difference_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform: left over right
     track_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform: true over believed
+    wheelbase_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform: true over believed
+    steering_zero_deg: Spread = 0.0  # plus or minus, uniform: of an Ackermann robot's wheels where 0 is reported
+    steering_share: float = Field(0.0, ge=0, lt=0.5)  # plus or minus, uniform: true angle over the reported one
     imu_angle_deg: Spread = 0.0  # sigma per axis
     gyro_scale_share: float = Field(0.0, ge=0, lt=0.1)  # sigma
 
@@ -173,6 +176,9 @@ class Installation(Section):
             wheel_radius_share=0.01,
             wheel_difference_share=0.004,
             track_share=0.015,
+            wheelbase_share=0.01,
+            steering_zero_deg=1.0,
+            steering_share=0.02,
             imu_angle_deg=0.5,
             gyro_scale_share=0.005,
         )
@@ -232,9 +238,9 @@ class Payload(Section):
 
 
 class Robot(Section):
-    """A wheeled robot. The base frame lies on the floor between the wheels."""
+    """A wheeled robot. The base frame lies on the floor between the wheels; of an Ackermann robot, the rear ones."""
 
-    kind: Literal["diff_drive", "skid_steer"] = "diff_drive"
+    kind: Literal["diff_drive", "skid_steer", "ackermann", "mecanum"] = "diff_drive"
     mass_kg: Positive = 6.0
     wheel_mass_kg: Positive = 0.2
     radius_m: Positive = 0.05  # nominal: what the odometry believes
@@ -242,8 +248,14 @@ class Robot(Section):
     wheel_width_m: Positive = 0.03
     track_m: Positive = 0.26
     track_scale: Positive = 1.0  # what regulator and odometry believe over the true track (skid-steer: more than 1)
-    wheelbase_m: Positive = 0.24  # skid-steer only
+    wheelbase_m: Positive = 0.24  # not of a differential drive
+    wheelbase_scale: Positive = 1.0  # what regulator and odometry believe over the true one
     caster_behind_m: Positive = 0.12  # differential drive only
+    steering_zero_rad: float = 0.0  # Ackermann only: angle of the wheels where the steering reports 0
+    steering_ratio: Positive = 1.0  # true angle over the reported one
+    max_steering_rad: float = Field(0.55, gt=0, lt=1.2)
+    steering_rad_s: Positive = 3.0  # rate of the steering's set point
+    rollers: int = Field(10, ge=6, le=16)  # of a mecanum wheel
     center_of_mass: Vector3 = (-0.02, 0.01, 0.045)
     chassis: Vector3 = (0.30, 0.20, 0.08)  # length, width, height
     payload: Payload | None = None

@@ -13,6 +13,7 @@ import numpy as np
 
 from fgloc.frames import OPTICAL_TO_BODY, rpy_matrix
 from fgloc.types import FloatArray, Landmark, LandmarkMap
+from fgloc_datasets.sim.drives import Wheel, wheels
 from fgloc_datasets.sim.scenario import (
     Camera,
     Humps,
@@ -219,12 +220,9 @@ def _roughness(rough: Rough, shape: tuple[int, int], seed: int) -> FloatArray:
 _CELL_PX = 64  # of a marker's texture
 _CHASSIS_CLEARANCE_M = 0.04
 _CASTER_RADIUS_M = 0.02
-
-
-def wheel_names(robot: Robot) -> tuple[str, ...]:
-    """Joint names of the wheels, left and right in turn."""
-    ends = ("",) if robot.kind == "diff_drive" else ("front_", "rear_")
-    return tuple(f"{end}{side}_wheel_joint" for end in ends for side in ("left", "right"))
+_STEERING_KP, _STEERING_KV, _STEERING_ARMATURE = 200.0, 3.0, 0.005  # Nm/rad, Nm s/rad, kg m²
+_ROLLER_SHARE = 0.24  # thickness in the middle over the wheel's diameter
+_ROLLER_MASS_KG, _ROLLER_ARMATURE, _ROLLER_DAMPING = 0.005, 1e-6, 1e-6
 
 
 def camera_rotation(camera: Camera) -> FloatArray:
@@ -362,11 +360,11 @@ def _robot(root: ET.Element, world: ET.Element, scenario: Scenario) -> None:
     robot = scenario.robot
     base = _add(world, "body", name="base")
     _add(base, "freejoint", name="base")
-    mass = robot.mass_kg - robot.wheel_mass_kg * len(wheel_names(robot))
+    mass = robot.mass_kg - robot.wheel_mass_kg * len(wheels(robot))
     length, width, height = robot.chassis
     inertia = mass / 12 * np.array([width**2 + height**2, length**2 + height**2, length**2 + width**2])
     _add(base, "inertial", pos=robot.center_of_mass, mass=mass, diaginertia=inertia)
-    middle = -0.05 if robot.kind == "diff_drive" else 0.0
+    middle = {"diff_drive": -0.05, "ackermann": 0.5 * robot.wheelbase_m}.get(robot.kind, 0.0)
     _add(
         base,
         "geom",
@@ -376,6 +374,7 @@ def _robot(root: ET.Element, world: ET.Element, scenario: Scenario) -> None:
         pos=(middle, 0, _CHASSIS_CLEARANCE_M + height / 2),
         rgba=(0.2, 0.3, 0.6, 1),
         friction=(0.1, 0.001, 0.0001),
+        **_touches(robot),
     )
     if scenario.camera is not None:
         rotation = camera_rotation(scenario.camera)
@@ -389,9 +388,13 @@ def _robot(root: ET.Element, world: ET.Element, scenario: Scenario) -> None:
             fovy=math.degrees(2 * math.atan(0.5 * render_height / focal)),
         )
     actuator = _add(root, "actuator")
-    for index, joint in enumerate(wheel_names(robot)):
-        _wheel(base, robot, joint, index)
-        _motor(actuator, robot.motor, joint)
+    for wheel in wheels(robot):
+        _wheel(base, robot, wheel)
+        if wheel.driven:
+            _motor(actuator, robot.motor, wheel.joint)
+    for wheel in wheels(robot):
+        if wheel.steered_by:
+            _add(actuator, "position", name=wheel.steered_by, joint=wheel.steered_by, kp=_STEERING_KP, kv=_STEERING_KV)
     if robot.kind == "diff_drive":
         _caster(base, robot)
     if robot.payload is not None:
@@ -415,37 +418,77 @@ def _caster(base: ET.Element, robot: Robot) -> None:
     )
 
 
-def _wheel(base: ET.Element, robot: Robot, joint: str, index: int) -> None:
-    left = index % 2 == 0
-    radius = robot.radius_m * robot.radius_scale[0 if left else 1]
-    x = 0.0 if robot.kind == "diff_drive" else robot.wheelbase_m * (0.5 if index < 2 else -0.5)
-    y = robot.track_m * (0.5 if left else -0.5)
-    body = _add(base, "body", name=joint.removesuffix("_joint"), pos=(x, y, radius))
+def _wheel(base: ET.Element, robot: Robot, wheel: Wheel) -> None:
+    name, place = wheel.joint.removesuffix("_joint"), (wheel.x, wheel.y, wheel.radius)
+    if wheel.steered_by:
+        base = _add(base, "body", name=wheel.steered_by.removesuffix("_joint"), pos=place)
+        _add(base, "joint", name=wheel.steered_by, axis=(0, 0, 1), armature=_STEERING_ARMATURE)
+        _add(base, "inertial", pos=(0, 0, 0), mass=0.05, diaginertia=(1e-5, 1e-5, 1e-5))
+        place = (0.0, 0.0, 0.0)
+    body = _add(base, "body", name=name, pos=place)
     motor = robot.motor
-    _add(
-        body,
-        "joint",
-        name=joint,
-        axis=(0, 1, 0),
-        armature=motor.armature,
-        damping=motor.damping,
-        frictionloss=motor.friction_nm,
-    )
+    turned = {"armature": motor.armature, "damping": motor.damping, "frictionloss": motor.friction_nm}
+    _add(body, "joint", name=wheel.joint, axis=(0, 1, 0), **(turned if wheel.driven else {"damping": 1e-4}))
+    rolls = {} if wheel.rollers else {"condim": 4, "priority": 1, **_tyre(robot)}
     _add(
         body,
         "geom",
-        name=joint.removesuffix("_joint"),
+        name=name,
         type="cylinder",
-        size=(radius, robot.wheel_width_m / 2),
+        size=(wheel.radius if not wheel.rollers else 0.6 * wheel.radius, robot.wheel_width_m / 2),
         euler=(math.pi / 2, 0, 0),
         mass=robot.wheel_mass_kg,
-        condim=4,
-        priority=1,
-        friction=(0.8, robot.contact.torsional_friction, robot.contact.rolling_friction),
-        solref=robot.contact.solref,
-        solimp=robot.contact.solimp,
+        **(rolls or {"contype": 0, "conaffinity": 0}),
         rgba=(0.1, 0.1, 0.1, 1),
     )
+    if wheel.rollers:
+        _rollers(body, robot, wheel)
+
+
+def _touches(robot: Robot) -> dict[str, object]:
+    """Attributes by which parts of the robot that overlap touch the room and not each other."""
+    return {"conaffinity": 0} if robot.kind in ("ackermann", "mecanum") else {}
+
+
+def _tyre(robot: Robot) -> dict[str, object]:
+    contact = robot.contact
+    return {
+        **_touches(robot),
+        "friction": (0.8, contact.torsional_friction, contact.rolling_friction),
+        "solref": contact.solref,
+        "solimp": contact.solimp,
+    }
+
+
+def _rollers(hub: ET.Element, robot: Robot, wheel: Wheel) -> None:
+    """Rollers of a mecanum wheel: ellipsoids whose axes lie at 45° to the axle, with joints of their own.
+
+    Their curvature along the axis makes the wheel round: a point of the axis at s from its middle is farther from the
+    axle by s² / 4d, where d is the distance of the middle, and the ellipsoid of half length √(2 d ρ) is thinner by as
+    much (to second order).
+    """
+    thick = _ROLLER_SHARE * wheel.radius
+    middle = wheel.radius - thick
+    for k in range(robot.rollers):
+        angle = math.tau * k / robot.rollers
+        c, s = math.cos(angle), math.sin(angle)
+        along = np.array([c, wheel.rollers, -s]) / math.sqrt(2.0)  # (1, ±1, 0) / √2 of the lowest, about the axle
+        name = f"{wheel.joint.removesuffix('_joint')}_roller{k}"
+        body = _add(hub, "body", name=name, pos=(-middle * s, 0.0, -middle * c))
+        _add(body, "joint", name=f"{name}_joint", axis=along, armature=_ROLLER_ARMATURE, damping=_ROLLER_DAMPING)
+        _add(
+            body,
+            "geom",
+            name=name,
+            type="ellipsoid",
+            size=(thick, thick, math.sqrt(2.0 * middle * thick)),
+            zaxis=along,
+            mass=_ROLLER_MASS_KG,
+            condim=3,  # a point: no torsional friction
+            priority=1,
+            **_tyre(robot),
+            rgba=(0.2, 0.2, 0.2, 1),
+        )
 
 
 def _motor(actuator: ET.Element, motor: Motor, joint: str) -> None:

@@ -25,10 +25,10 @@ from fgloc.types import FloatArray, IntArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message
 from fgloc_datasets.sim.camera import CornerDetector, Exposure, Shot, exposures, light_level, shots
+from fgloc_datasets.sim.drives import Command, believed, steering_names, twists, wheel_names
 from fgloc_datasets.sim.installed import camera_jitter_s
 from fgloc_datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
 from fgloc_datasets.sim.scenario import Gnss, Robot, Scenario, Uwb, channel_rng
-from fgloc_datasets.sim.scene import wheel_names
 
 # --- Rows -------------------------------------------------------------------------------------------------------------
 
@@ -68,6 +68,7 @@ class Rows(Generic[T]):
 
 # --- Wheels and inertial sensors --------------------------------------------------------------------------------------
 
+_STEERING_STEP_RAD = math.tau / 4096  # of an absolute encoder of 12 bits
 _GRAVITY = np.array([0.0, 0.0, 9.81])
 
 
@@ -84,18 +85,23 @@ def odometry(
         before: ``(3,)`` pose at the message before the first; None: there is none.
 
     Returns:
-        Poses ``(n, 3)`` and twists ``(n, 2)`` (v, ω) of the last interval.
+        Poses and twists ``(n, 3)`` of the last interval.
     """
     turned = encoders(log, robot, every, messages)[1]
-    left = turned[:, 0::2].mean(axis=1) * robot.radius_m
-    right = turned[:, 1::2].mean(axis=1) * robot.radius_m
-    along, turn = 0.5 * (left + right), (right - left) / (robot.track_m * robot.track_scale)
+    steering = steering_angles(log, every, messages)
+    moved = twists(robot, believed(robot), robot.track_m * robot.track_scale, turned, steering)
     poses = np.zeros((len(turned), 3))
     for i in range(len(poses)):
         last = poses[i - 1] if i else before
         if last is not None:
-            poses[i] = se2.compose(last, se2.exp((along[i], 0.0, turn[i])))
-    return poses, np.column_stack([along, turn]) / (every * TICK_S)
+            poses[i] = se2.compose(last, se2.exp(moved[i]))
+    return poses, moved / (every * TICK_S)
+
+
+def steering_angles(log: Log, every: int, messages: slice) -> FloatArray:
+    """Angles ``(n, k)`` [rad] of the steering that messages report, in whole steps of its encoder."""
+    last = None if messages.stop is None else (messages.stop - 1) * every + 1
+    return np.round(log.steering[messages.start * every : last : every] / _STEERING_STEP_RAD) * _STEERING_STEP_RAD
 
 
 def encoders(log: Log, robot: Robot, every: int, messages: slice) -> tuple[FloatArray, FloatArray]:
@@ -300,12 +306,22 @@ def stamp_ns(seconds: float) -> int:
     return EPOCH_NS + round(seconds * 1e9)
 
 
+def command_topic(robot: Robot) -> str:
+    """Topic of the commands."""
+    return "/ackermann_cmd" if robot.kind == "ackermann" else "/cmd_vel"
+
+
 def _commands(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     stamps = _stamps(log.commands[:, 0])
+    topic, steers = command_topic(scene.scenario.robot), scene.scenario.robot.kind == "ackermann"
 
     def write(i: int, received: int) -> None:
-        _, v, omega = log.commands[i]
-        bag.command("/cmd_vel", stamps[i], v=v, omega=omega, frame_id="base_link", received_ns=received)
+        command = Command(*log.commands[i, 1:].tolist())
+        if steers:
+            bag.ackermann(topic, stamps[i], command.v, command.steering, received_ns=received)
+        else:
+            moved = {"v": command.v, "omega": command.omega, "vy": command.vy}
+            bag.command(topic, stamps[i], **moved, frame_id="base_link", received_ns=received)
 
     return _messages(_received(scene, "command", stamps), write)
 
@@ -315,7 +331,7 @@ def _wheels(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
     robot = scene.scenario.robot
     every, ticks = _ticks(log, scene.scenario.rates.odometry)
     stamps, late = _stamps(log.stamps_s[ticks]), round(1e9 * scene.installed.wheels.time_offset_s)
-    names = wheel_names(robot)
+    names, steered = wheel_names(robot), steering_names(robot)
     noise = channel_rng(scene.seed, "effort").normal(0, robot.motor.effort_noise_nm, (len(ticks), len(names)))
     twist_cov = np.diag([_ODOMETRY_VARIANCE[0], 1e-6, 1e-6, 1e-6, 1e-6, _ODOMETRY_VARIANCE[1]])
     reached: FloatArray | None = None
@@ -326,7 +342,12 @@ def _wheels(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
         reached = poses[-1]
         angles, turned = encoders(log, robot, every, slice(first, last))
         effort = mean_over(log.torques, every, first, last) + noise[first:last]
-        return poses, twists, angles, turned / (every * TICK_S), effort
+        rates = turned / (every * TICK_S)
+        if steered:  # they report angles alone
+            steering = steering_angles(log, every, slice(first, last))
+            unknown = np.full_like(steering, np.nan)
+            angles, rates, effort = (np.hstack(p) for p in ((angles, steering), (rates, unknown), (effort, unknown)))
+        return poses, twists, angles, rates, effort
 
     rows = Rows(log, ticks, make)
 
@@ -336,7 +357,8 @@ def _wheels(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
 
     def write_joints(i: int, received: int) -> None:
         (*_, angles, rates, effort), k = rows.at(i)
-        bag.joints("/joint_states", stamps[i] + late, names, angles[k], rates[k], effort[k], received_ns=received)
+        these = (*names, *steered)
+        bag.joints("/joint_states", stamps[i] + late, these, angles[k], rates[k], effort[k], received_ns=received)
 
     return _messages(_received(scene, "odometry", stamps), write_odometry, write_joints)
 
@@ -393,7 +415,7 @@ def _truth(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
 
     def write_slip(i: int, received: int) -> None:
         (true, wheels, _), k = rows.at(i)
-        forward, left, turn = true[k] - (wheels[k, 0], 0.0, wheels[k, 1])
+        forward, left, turn = true[k] - wheels[k]
         bag.twist("/truth/slip", stamps[i], (forward, left, 0.0), (0.0, 0.0, turn), received_ns=received)
 
     def write_flag(i: int, received: int) -> None:

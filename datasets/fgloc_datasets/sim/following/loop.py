@@ -36,7 +36,7 @@ from fgloc.sensors.markers.images import CornersEvent, ImageEvent
 from fgloc.types import Event, FloatArray, LandmarkMap, Mode, TruthEvent
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message
-from fgloc_datasets.sim.control import Command
+from fgloc_datasets.sim.drives import Command, as_driven
 from fgloc_datasets.sim.following.pursuit import Curve, Pursuit, PursuitSettings, State, WaypointPath
 from fgloc_datasets.sim.physics import Scene, Simulation, make_scene
 from fgloc_datasets.sim.record import RUN_FILES, robot_settings, write_beside
@@ -437,7 +437,7 @@ def _drive(drive: Drive, scene: Scene, bag_folder: Path) -> Followed:
             if isinstance(channel, Generator):  # the drive may end before its messages do
                 stack.enter_context(closing(channel))
         pursuit = Pursuit(curve, drive.path.speed_m_s, drive.settings)
-        loop = ClosedLoop(Written(channels), arrivals, sensors, source, pursuit, scene.scenario.control.rest_s)
+        loop = ClosedLoop(Written(channels), arrivals, sensors, source, pursuit, scene.scenario)
         log = simulation.run(loop)
     true = np.column_stack([log.positions, log.quaternions])[: log.ticks]
     return Followed.of(curve, true, np.array(loop.rows), tuple(loop.states))
@@ -498,11 +498,12 @@ class ClosedLoop:
         sensors: FailingSensors,
         source: PoseSource,
         pursuit: Pursuit,
-        rest_s: float,
+        scenario: Scenario,
     ) -> None:
-        """Connect the parts; the robot stands for ``rest_s`` at first."""
+        """Connect the parts; the robot stands at first, as the scenario says."""
         self._written, self._arrivals, self._sensors = written, arrivals, sensors
-        self._source, self._pursuit, self._rest_s = source, pursuit, rest_s
+        self._source, self._pursuit, self._rest_s = source, pursuit, scenario.control.rest_s
+        self._robot, self._steering = scenario.robot, 0.0
         self._arrived_s: float | None = None
         self.rows: list[tuple[float, ...]] = []
         self.states: list[State] = []
@@ -515,12 +516,14 @@ class ClosedLoop:
             self._source.push(event)
         known, sigma = self._source.pose(now_ns, np.array(pose))
         resting = t < self._rest_s
-        v, omega = (0.0, 0.0) if resting else self._pursuit.command(t, known, sigma)
+        wanted = (0.0, 0.0) if resting else self._pursuit.command(t, known, sigma)
+        command = as_driven(self._robot, *wanted, steering=self._steering)
+        self._steering = command.steering
         shown: FloatArray = np.full(3, np.nan) if known is None else known
-        self.rows.append((t, *shown.tolist(), sigma, v, omega))
+        self.rows.append((t, *shown.tolist(), sigma, command.v, command.omega))
         self.states.append(State.STOPPED if resting else self._pursuit.state)
         if self._pursuit.state is State.ARRIVED:
             self._arrived_s = t if self._arrived_s is None else self._arrived_s
             if t - self._arrived_s >= _RESTS_S:
                 return None
-        return v, omega
+        return command

@@ -25,7 +25,7 @@ from scipy.interpolate import Akima1DInterpolator
 from fgloc.errors import ConfigError
 from fgloc.files.settings import Settings
 from fgloc.types import FloatArray
-from fgloc_datasets.sim.control import Command
+from fgloc_datasets.sim.control import Wanted
 from fgloc_datasets.sim.scenario import Positive, Section, Vector2
 
 # --- Paths ------------------------------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ class Pursuit:
         self._last: tuple[float, float] | None = None  # time and yaw of the last command
         self._curvature = _curvature(curve)
 
-    def command(self, t: float, pose: FloatArray | None, position_sigma_m: float = 0.0) -> Command:
+    def command(self, t: float, pose: FloatArray | None, position_sigma_m: float = 0.0) -> Wanted:
         """Forward speed [m/s] and yaw rate [rad/s].
 
         Args:
@@ -210,7 +210,7 @@ class Pursuit:
             self._looked_rad += turned
         return math.tau - self._looked_rad
 
-    def _pursue(self, pose: FloatArray, left_m: float, trust: float) -> Command:
+    def _pursue(self, pose: FloatArray, left_m: float, trust: float) -> Wanted:
         s = self._settings
         reach = min(max(s.lookahead_s * self._v, s.lookahead_m[0]), s.lookahead_m[1])
         ahead = self._ahead(pose, reach)
@@ -227,7 +227,7 @@ class Pursuit:
         self._v = min(max(speed, min(s.least_speed_m_s, self._speed)), s.max_omega / max(abs(curvature), 1e-9))
         return self._v, self._v * curvature
 
-    def _stand(self, t: float) -> Command:
+    def _stand(self, t: float) -> Wanted:
         self._v = 0.0
         self._stopped_since_s = t if self._stopped_since_s is None else self._stopped_since_s
         if t - self._stopped_since_s < self._settings.search_after_s:
