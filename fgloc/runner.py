@@ -29,7 +29,7 @@ from fgloc.types import Estimate, Finding, FloatArray, Ground, Severity, Traject
 
 # --- Results besides poses, and their sentences -------------------------------------------------
 
-_GRAVE = re.compile(r"another (frame|clock)|is damaged|cannot be decoded|perhaps degrees")
+_GRAVE = re.compile(r"another (frame|clock)|is damaged|cannot be decoded|perhaps degrees|none of the ids")
 
 
 @dataclass(frozen=True, slots=True)

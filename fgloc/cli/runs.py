@@ -115,6 +115,7 @@ def smooth(
     (bag,) = bags
     forms = figure_formats(figures)
     spare_inputs(out, bag, map_file, config, force)
+    _say_inputs(bag, map_file, config)
     result = _localize(bag, map_file, configured(bag, config, model), out, "batch")
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
@@ -135,8 +136,22 @@ def online(
     forms = figure_formats(figures)
     pace = 1.0 if speed is Speed.REAL_TIME else None
     spare_inputs(out, bag, map_file, config, force)
+    _say_inputs(bag, map_file, config)
     result = _localize(bag, map_file, configured(bag, config, model), out, "online", pace)
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
+
+
+def _say_inputs(bag: Path, map_file: Path | None, config_file: Path | None) -> None:
+    """Print which map and configuration are read, also where they were not asked for."""
+    from fgloc.recording.storage import find_beside
+
+    for given, name, without in (
+        (map_file, "map", "none: landmarks are estimated with the trajectory"),
+        (config_file, "robot", "defaults"),
+    ):
+        file = given or find_beside(bag, f"{name}.yaml")
+        used = without if file is None else f"{file}" + ("" if given else " (beside the recording)")
+        say(f"{'configuration' if name == 'robot' else name}: {used}")
 
 
 def _localize(
@@ -177,6 +192,9 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
+    if metrics.ate_mean_m is not None:
+        align = " --align" if result.config is not None and result.config.truth.align != "none" else ""
+        rows.append(("evo", f"evo_ape tum {out / 'truth.tum'} {out / 'trajectory.tum'}{align}"))
     rows += [(name, str(path)) for name, path in (("MCAP", mcap), ("rerun", rrd)) if path is not None]
     for finding in metrics.findings:
         if finding.severity != "note":

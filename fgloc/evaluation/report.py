@@ -144,6 +144,8 @@ def _modes(modes: Sequence[Mode]) -> str:
     counts = Counter(modes)
     shares = ", ".join(f"{mode} {100.0 * counts[mode] / len(modes):.1f} %" for mode in Mode if counts[mode])
     lost = " The robot was LOST for part of the run: do not use these stretches." if counts[Mode.LOST] else ""
+    if counts[Mode.LOST] == len(modes):
+        lost = " The robot was LOST for the whole run: do not use it."
     return f"Modes: {shares}.{lost}"
 
 
@@ -257,6 +259,7 @@ def _number(value: float | None, factor: float, form: str) -> str:
 _FIGURES = ("trajectory", "error", "timeline", "space", "height")  # the last two: on uneven ground
 FILES = (
     "trajectory.tum",
+    "truth.tum",
     "covariance.csv",
     "steps.csv",
     "metrics.json",
@@ -304,6 +307,8 @@ def write_results(
     files = {f"{name}.{form}": image_of(figure, form) for form in figures for name, figure in drawn.items()}
     with atomic_folder(out, own=FILES) as stage:
         write_tum(stage / "trajectory.tum", result.trajectory)
+        if result.truth is not None and len(result.truth):
+            write_tum(stage / "truth.tum", result.truth)
         write_covariance_csv(stage / "covariance.csv", result.trajectory)
         write_steps_csv(stage / "steps.csv", result.decisions, numbered(result))
         write_json(stage / "metrics.json", metrics.model_dump())

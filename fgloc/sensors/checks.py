@@ -99,6 +99,11 @@ def _indefinite(r: list[float], diagonal: list[float]) -> bool:
     return bool(np.linalg.eigvalsh(matrix, UPLO="L")[0] < -_INDEFINITE)
 
 
+def _listed(ids: Collection[int]) -> str:
+    """The first of some ids, for a sentence."""
+    return ", ".join(map(str, sorted(ids)[:_SHOWN_IDS])) + (", ..." if len(ids) > _SHOWN_IDS else "")
+
+
 class FieldChecks:
     """Shared state of the validators of one run: bounds, notes, counts of rejected parts, and ids of known landmarks.
 
@@ -120,6 +125,7 @@ class FieldChecks:
         self._note = note
         self._known = None if known_ids is None else frozenset(known_ids)
         self._unknown: set[int] = set()
+        self._any_known = False
         self._covs: dict[tuple[str, str], tuple[bytes, FloatArray | str]] = {}  # last covariance and its verdict
 
     @property
@@ -127,9 +133,10 @@ class FieldChecks:
         """Note for the user on ids that were ignored, as the map does not have them; empty if there are none."""
         if not self._unknown:
             return ()
-        ids = ", ".join(str(i) for i in sorted(self._unknown)[:_SHOWN_IDS])
-        more = ", ..." if len(self._unknown) > _SHOWN_IDS else ""
-        return (f"sightings of ids that are not in the map are ignored: {ids}{more}",)
+        unknown, known = _listed(self._unknown), _listed(self._known or ())
+        if not self._any_known:
+            return (f"none of the ids that were seen ({unknown}) is in the map, which has {known or 'none'}",)
+        return (f"sightings of ids that are not in the map are ignored: {unknown} (it has {known})",)
 
     def note(self, text: str) -> None:
         """Add a note for the user."""
@@ -161,6 +168,7 @@ class FieldChecks:
 
     def _is_unknown(self, landmark_id: int) -> bool:
         if self._known is None or landmark_id in self._known:
+            self._any_known = True
             return False
         if len(self._unknown) < _KEPT_IDS:
             self._unknown.add(landmark_id)

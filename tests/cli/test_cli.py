@@ -22,6 +22,7 @@ START_NS = 1_700_000_000_000_000_000
 BEACONS = {0: (3.0, 0.0), 1: (0.0, 3.0), 2: (-3.0, 0.0), 4: (0.0, -3.0)}
 FILES = {
     "trajectory.tum",
+    "truth.tum",
     "covariance.csv",
     "steps.csv",
     "metrics.json",

@@ -22,6 +22,7 @@ from fgloc.types import Mode, Trajectory
 
 FILES = {
     "trajectory.tum",
+    "truth.tum",
     "covariance.csv",
     "steps.csv",
     "metrics.json",

@@ -38,7 +38,7 @@ def test_sightings_dropped_for_their_stamps_are_said_first_and_exit_with_3(tmp_p
     bag = write_late_circle(tmp_path, 20.0)
     code, stdout, stderr = fgloc(command, bag, "--out", tmp_path / "out")
     assert code == 3, stderr
-    first = stdout.splitlines()[0]
+    first = stdout.splitlines()[2]  # after the map and the configuration that are read
     assert first.startswith("error: None of the sightings on /landmarks was used, for their stamps do not fit")
     assert "recording.received_stamps: [sightings]" in first
     assert "dead reckoning" in (tmp_path / "out" / "report.html").read_text()
