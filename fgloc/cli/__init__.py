@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -63,20 +64,46 @@ def common(
     """Where a wheeled robot is, without GPS, with an honest covariance."""
 
 
-app.command()(runs.demo)
-app.command()(robot.info)
-app.command()(robot.init)
-app.command()(runs.smooth)
-app.command()(runs.online)
-app.command()(live.live)
-app.command()(live.play)
-app.command()(runs.evaluate)
-app.command()(runs.export)
-app.command(name="map")(robot.make_map)
-app.command()(robot.calibrate)
-app.command()(data.train)
-app.command()(data.evaluate_model)
-app.command()(runs.ablate)
+_COMMANDS: tuple[tuple[str, Callable[..., None], tuple[str, ...]], ...] = (  # with examples
+    ("demo", runs.demo, ("fgloc demo",)),
+    ("info", robot.info, ("fgloc info run.bag --config robot.yaml",)),
+    ("init", robot.init, ("fgloc init run.bag", "fgloc init run.mcap --out robot.yaml")),
+    (
+        "smooth",
+        runs.smooth,
+        (
+            "fgloc smooth run.bag --config robot.yaml --map map.yaml --out results",
+            "fgloc smooth *.mcap --config robot.yaml --out results    # a folder for each",
+        ),
+    ),
+    (
+        "online",
+        runs.online,
+        (
+            "fgloc online run.bag --config robot.yaml --map map.yaml --out results",
+            "fgloc online run.bag --config results/installation.yaml --map results/map.yaml --out again",
+        ),
+    ),
+    ("live", live.live, ("fgloc live --map map.yaml --config robot.yaml --state run.state",)),
+    ("play", live.play, ("fgloc play run.bag",)),
+    ("evaluate", runs.evaluate, ("fgloc evaluate results/trajectory.tum results/truth.tum --align se2",)),
+    ("export", runs.export, ("fgloc export results --mcap run.mcap",)),
+    ("map", robot.make_map, ("fgloc map tour.bag --dictionary DICT_4X4_50 --size 0.2 --out map.yaml",)),
+    (
+        "calibrate",
+        robot.calibrate,
+        ("fgloc calibrate run.bag --map map.yaml --config robot.yaml --out calibrated.yaml",),
+    ),
+    (
+        "train",
+        data.train,
+        ("fgloc train --init run1.bag run2.bag --out train.yaml", "fgloc train train.yaml --out models"),
+    ),
+    ("evaluate-model", data.evaluate_model, ("fgloc evaluate-model models/model.safetensors run.bag",)),
+    ("ablate", runs.ablate, ("fgloc ablate suite.yaml --out swept",)),
+)
+for _name, _command, _examples in _COMMANDS:
+    app.command(name=_name, epilog="\b\nExamples:\n" + "\n".join(f"  {line}" for line in _examples))(_command)
 app.add_typer(data.sim_app, name="sim")
 app.add_typer(data.convert_app, name="convert")
 

@@ -348,7 +348,7 @@ def train(
 
 def evaluate_model(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="a .safetensors that fgloc train wrote")],
-    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help=BAG_HELP)],
+    bags: Annotated[list[Path], typer.Argument(metavar="BAG", help=BAG_HELP)],
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="also write the figures here")
     ] = None,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BAG_HELP = "ROS 1 .bag, rosbag2 folder, .mcap or .db3"
 
 Bag = Annotated[Path, typer.Argument(metavar="BAG", help=BAG_HELP)]
-Bags = Annotated[list[Path], typer.Argument(metavar="BAG...", help=BAG_HELP)]
+Bags = Annotated[list[Path], typer.Argument(metavar="BAG", help=BAG_HELP)]
 Out = Annotated[
     Path, typer.Option("--out", metavar="DIR", file_okay=False, help="folder for the results; made if missing")
 ]

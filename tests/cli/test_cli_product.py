@@ -1,5 +1,7 @@
 """What a new user meets: help, version, missing extras, progress on a pipe, Ctrl-C, the first steps with a robot."""
 
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -11,9 +13,10 @@ import pytest
 import yaml
 from command_line import fgloc
 from test_cli import write_circle
+from typer.main import get_command
 
 from fgloc import instrumentation as progress
-from fgloc.cli import options
+from fgloc.cli import app, options
 from fgloc.cli.terminal import LINE_S, Lines
 from fgloc.config import Config, WheelsConfig, config_of, load_config
 from fgloc.evaluation.metrics import all_findings, compute_metrics
@@ -49,6 +52,18 @@ def test_the_lists_of_commands_show_whole_sentences():
     for group in ((), ("sim",), ("convert",)):
         listed = fgloc(*group, "-h")[1].partition("Commands:")[2].strip().splitlines()
         assert all(line.endswith(".") and not line.endswith("..") for line in listed), listed
+
+
+@pytest.mark.parametrize("name", sorted(get_command(app).commands))
+def test_examples_of_a_command_are_understood(name):
+    command = get_command(app).commands[name]
+    examples = re.findall(r"^ +fgloc ([^#\n]+)", command.epilog or "", re.MULTILINE)
+    assert examples or hasattr(command, "commands")
+    for example in examples:
+        first, *arguments = shlex.split(example)
+        assert first == name
+        with command.make_context(name, arguments) as context:
+            assert context.params
 
 
 def test_completion_is_offered():
