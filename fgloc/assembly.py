@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fgloc.config import Config
 from fgloc.diagnosis.handling import FloorWatch
-from fgloc.diagnosis.mistakes import Diagnosis
+from fgloc.diagnosis.mistakes import Diagnoses, Diagnosis, diagnosis_of
 from fgloc.diagnosis.sanity import Sanity
 from fgloc.estimation.localizer import Localizer
 from fgloc.intake.keyframing import KeyframeBuilder
@@ -36,11 +36,11 @@ class Assembly:
     stepper: KeyframeBuilder
     wheels: WheelMotion
     landmarks: LandmarkSensor
-    camera: Camera | None
+    cameras: tuple[Camera, ...]
     learned: LearnedMotion | None
     sensors: tuple[Sensor, ...]
     localizer: Localizer
-    diagnosis: Diagnosis
+    diagnosis: Diagnosis | Diagnoses
     sanity: Sanity
     notes: tuple[str, ...]
 
@@ -98,7 +98,7 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
 
 def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
-    learned, camera = setup.learned, setup.camera
+    learned, cameras = setup.learned, setup.cameras
     joint = learned.model.joint if learned is not None and config.motion.correlation == "joint" else None
     wheels = WheelMotion(config.wheels)
     gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
@@ -106,25 +106,26 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     attitude = None if setup.T_base_imu is None else Attitude(config.gyro, setup.T_base_imu)
     flat = config.estimator.ground == "flat"
     motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude, not setup.sees, setup.beside)
-    landmarks = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)
-    seen = LandmarkSensor(config, landmark_map, camera, setup.T_base_sensor)  # what it refuses does not count
+    landmarks = LandmarkSensor(config, landmark_map, cameras, setup.T_base_sensor)
+    seen = LandmarkSensor(config, landmark_map, cameras, setup.T_base_sensor)  # what it refuses does not count
     floor = FloorWatch(attitude, wheels, seen, landmark_map) if flat else None
     known_ids = None if landmark_map is None else set(landmark_map.landmarks)
     streams = [stream for sensor in sensors for stream in sensor.streams]
+    named = {topic: camera.name for camera in cameras for topic in camera.topics}
     return Assembly(
         config=config,
         landmark_map=landmark_map,
-        gate=EventValidator(reported_bounds(config), known_ids, streams),
+        gate=EventValidator(reported_bounds(config), known_ids, streams, named),
         detector=setup.detector,
-        detections=EventValidator(reported_bounds(config), known_ids),
-        stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s, streams),
+        detections=EventValidator(reported_bounds(config), known_ids, named=named),
+        stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s, streams, named),
         wheels=wheels,
         landmarks=landmarks,
-        camera=camera,
+        cameras=cameras,
         learned=learned,
         sensors=sensors,
         localizer=Localizer(config, landmark_map, motion, PoseSensors(landmarks, sensors), keep_all),
-        diagnosis=Diagnosis(config, landmark_map, camera, setup.T_base_sensor, setup.imu_up, floor),
-        sanity=Sanity(config, landmark_map, camera, setup.T_base_sensor, wheels, watched_gyro),
+        diagnosis=diagnosis_of(config, landmark_map, cameras, setup.T_base_sensor, setup.imu_up, floor),
+        sanity=Sanity(config, landmark_map, cameras, setup.T_base_sensor, wheels, watched_gyro),
         notes=setup.notes,
     )

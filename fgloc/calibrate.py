@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc.calibration.installation import found_text, settings_found, with_settings
 from fgloc.calibration.truth import calibrate_by_truth
-from fgloc.config import Config
+from fgloc.config import Config, base_role, base_roles
 from fgloc.errors import EstimatorError
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
@@ -64,7 +64,7 @@ def _only_truth(bag: Path, config: Config) -> bool:
     """Whether nothing but a truth tells where the robot was."""
     with open_recording(bag, config.recording) as recording:
         seeing = {"image", "sightings", *(s.role for sensor in registry.sensors() for s in sensor.streams)}
-        return "truth" in recording.roles and not seeing & recording.roles.keys()
+        return "truth" in recording.roles and not seeing & base_roles(recording.roles)
 
 
 def _of_odometer(settings: Sequence[Setting]) -> list[Setting]:
@@ -99,7 +99,7 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
         result = run(bag, map_path, tried, "batch", progress, check=False)
         if result.found is not None and result.found.wheels != "command":
             break
-    if not any(result.counts.get(kind) for kind in registry.landmark_kinds()):
+    if not any(base_role(kind) in registry.landmark_kinds() for kind, n in result.counts.items() if n):
         raise EstimatorError(
             f"{bag}: no sighting of a landmark was used, and without sightings nothing determines the "
             f"gains of the wheels; see `fgloc info {bag}`"

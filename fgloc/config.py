@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 import yaml
-from pydantic import AfterValidator, BeforeValidator, Field, create_model, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PrivateAttr,
+    StringConstraints,
+    create_model,
+    model_validator,
+)
 
 from fgloc.drives.every import AnyDrive
 from fgloc.errors import ConfigError
@@ -139,6 +147,9 @@ class GyroConfig(Section):
     bias_walk: float = constant(0.0003, "of a MEMS gyro; rests measure the bias", ge=0, le=10, description="rad/s/√s")
 
 
+_Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
+
+
 class CameraConfig(Section):
     """The camera, where the recording does not say."""
 
@@ -171,6 +182,26 @@ class CameraConfig(Section):
         le=0.1,
         description="s: what each stamp is off by on its own",
     )
+
+
+class NamedCameraConfig(CameraConfig):
+    """One of several cameras: its topics, its place, and what `CameraConfig` has."""
+
+    image: str | None = Field(None, description="topic of its images")
+    camera_info: str | None = Field(None, description="topic of its calibration; None: the one beside its images")
+    sightings: str | None = Field(None, description="topic of what another node has found in its images")
+    pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
+        None, description="in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
+    )
+    axes: Literal["body", "optical"] | None = Field(
+        None, description="axes that pose refers to: z forward (optical; None too), or x forward"
+    )
+
+    @model_validator(mode="after")
+    def _has_a_topic(self) -> NamedCameraConfig:
+        if self.image is None and self.sightings is None:
+            raise ValueError("a camera needs the topic of its images (image) or of the markers in them (sightings)")
+        return self
 
 
 class LandmarksConfig(Section):
@@ -305,12 +336,18 @@ def is_motion_source(name: str) -> bool:
     return name in MOTION_SOURCES or name.startswith(BESIDE)
 
 
+_CameraName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
+
+
 class SensorSections(Section):
     """Settings of the built-in sensors, by their keys of ``robot.yaml``: one line each."""
 
     wheels: WheelsConfig = WheelsConfig()
     gyro: GyroConfig = GyroConfig()
     camera: CameraConfig = CameraConfig()
+    cameras: dict[_CameraName, NamedCameraConfig] = Field(
+        {}, description="several cameras in place of one, by name (docs/cameras.md)"
+    )
     markers: MarkersConfig = MarkersConfig()
     landmarks: LandmarksConfig = LandmarksConfig()
     motion: MotionConfig = MotionConfig()
@@ -318,12 +355,35 @@ class SensorSections(Section):
 
 # --- The configuration ------------------------------------------------------------------------------------------------
 
-_Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
 _Far = Annotated[float, Field(ge=-1e9, le=1e9)]  # m or rad, in a map
 _Sigma = Annotated[float, Field(ge=1e-6, le=1e4)]  # m or rad
 Role = str
 """Of a topic: a built-in one, or one that a sensor of another package brings."""
 BUILT_IN_ROLES = ("odometry", "command", "joints", "imu", "image", "camera_info", "sightings", "truth")
+
+
+CAMERA_ROLES = ("image", "camera_info", "sightings")
+"""Roles that each camera has."""
+
+
+def camera_role(camera: str, role: Role) -> Role:
+    """Role of one of several cameras: ``front/image``; of one camera, whose name is "", the role itself."""
+    return f"{camera}/{role}" if camera else role
+
+
+def camera_folder(topic: str) -> str:
+    """Namespace of a camera: the folder of its images, its calibration, or what is found in its images."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]
+
+
+def base_role(role: Role) -> Role:
+    """Role without the camera that it is of: ``image`` of ``front/image``."""
+    return role.rpartition("/")[2]
+
+
+def base_roles(roles: Iterable[Role]) -> frozenset[Role]:
+    """`base_role` of each."""
+    return frozenset(map(base_role, roles))
 
 
 def role_names() -> tuple[Role, ...]:
@@ -333,8 +393,9 @@ def role_names() -> tuple[Role, ...]:
 
 
 def _known_role(role: str) -> str:
-    if role not in role_names() and not role.startswith(BESIDE):
-        raise ValueError(f"expected one of {', '.join(role_names())}, or {BESIDE}NAME of recording.odometries")
+    if role not in role_names() and not role.startswith(BESIDE) and base_role(role) not in CAMERA_ROLES:
+        names = ", ".join(role_names())
+        raise ValueError(f"expected one of {names}, {BESIDE}NAME of recording.odometries, or a camera's: front/image")
     return role
 
 
@@ -359,9 +420,28 @@ class TopicsConfig(Section):
     sightings: str | None = None
     truth: str | None = None
 
+    _cameras: dict[Role, str | None] = PrivateAttr(default_factory=dict)
+
+    @property
+    def of_cameras(self) -> Mapping[Role, str | None]:
+        """Topic that is given for each role of several cameras, as `camera_role` names them; empty: there is one."""
+        return self._cameras
+
+    def role_on(self, topic: str, base: Role) -> Role:
+        """Role of a topic that plays this one, of the camera that it is of where there are several."""
+        same = [(role, given) for role, given in self._cameras.items() if base_role(role) == base]
+        for role, given in same:
+            beside = {self._cameras[role.removesuffix(base) + r] for r in ("image", "sightings")} - {None, "none"}
+            if given == topic or (given is None and camera_folder(topic) in {camera_folder(str(t)) for t in beside}):
+                return role
+        return base
+
     def given(self, role: Role) -> str | None:
         """Topic that is given for a role; None: none is given."""
-        return getattr(self, role, None)
+        if role in self._cameras:
+            return self._cameras[role]
+        given: str | None = getattr(self, role, None)
+        return "none" if given is None and self._cameras and role in CAMERA_ROLES else given
 
 
 class OdometryTopic(Section):
@@ -611,11 +691,81 @@ class Config(SensorSections):
     live: LiveConfig = LiveConfig()
     truth: TruthConfig = TruthConfig()
 
+    @model_validator(mode="after")
+    def _with_topics_of_cameras(self) -> Self:
+        """Tell `recording.topics` of the cameras' topics, by which a recording is read."""
+        if self.cameras and self.camera != CameraConfig():
+            raise ValueError("camera is one camera and cameras are several; give one of the two sections")
+        self.__dict__["recording"] = _with_topics(self.recording, self.cameras)
+        return self
+
+    def of_camera(self, name: str) -> Config:
+        """The configuration of a robot that has this camera alone; the configuration itself for the name ""."""
+        if not name:
+            return self
+        entry, recording = self.cameras[name], self.recording
+        own = {key: getattr(entry, key) for key in entry.model_fields_set & CameraConfig.model_fields.keys()}
+        image, info, sightings = entry.image or "none", entry.camera_info, entry.sightings or "none"
+        topics = _with_topics(recording, {}).topics.model_copy(
+            update={"image": image, "camera_info": info, "sightings": sightings}
+        )
+        alone = {camera_role(name, role): role for role in CAMERA_ROLES}
+        update = {
+            "topics": topics,
+            "received_stamps": tuple(alone.get(role, role) for role in recording.received_stamps),
+            "stamp_offset_s": {alone.get(role, role): s for role, s in recording.stamp_offset_s.items()},
+            "sightings_pose": entry.pose,
+            "sightings_axes": entry.axes,
+        }
+        camera = CameraConfig.model_validate(own)
+        return self.model_copy(
+            update={"camera": camera, "cameras": {}, "recording": recording.model_copy(update=update)}
+        )
+
+    def with_camera(self, name: str, alone: Config) -> Config:
+        """The configuration after that of `of_camera` was changed: what is the camera's own goes to its section."""
+        if not name:
+            return alone
+        entry, recording = self.cameras[name], alone.recording
+        own = {key: getattr(alone.camera, key) for key in alone.camera.model_fields_set}
+        if recording.sightings_pose is not None:
+            own |= {"pose": recording.sightings_pose, "axes": recording.sightings_axes}
+        cameras = {**self.cameras, name: entry.model_copy(update=own)}
+        named = {role: camera_role(name, role) for role in CAMERA_ROLES}
+        update = {
+            "topics": self.recording.topics,
+            "received_stamps": tuple(named.get(role, role) for role in recording.received_stamps),
+            "stamp_offset_s": {named.get(role, role): s for role, s in recording.stamp_offset_s.items()},
+            "sightings_pose": self.recording.sightings_pose,
+            "sightings_axes": self.recording.sightings_axes,
+        }
+        return alone.model_copy(
+            update={"camera": self.camera, "cameras": cameras, "recording": recording.model_copy(update=update)}
+        )
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Names of the cameras; ("",) where there is one."""
+        return tuple(self.cameras) or ("",)
+
     def __reduce_ex__(self, protocol: Any) -> Any:
         """With sections of other packages, its class has no name to be found by in another process."""
         if type(self) is Config:
             return super().__reduce_ex__(protocol)
         return config_of, (self.model_dump(exclude_unset=True),)
+
+
+def _with_topics(recording: RecordingConfig, cameras: Mapping[str, NamedCameraConfig]) -> RecordingConfig:
+    roles = {
+        camera_role(name, role): getattr(camera, role) or (None if role == "camera_info" else "none")
+        for name, camera in cameras.items()
+        for role in CAMERA_ROLES
+    }
+    if recording.topics.of_cameras == roles:
+        return recording
+    topics = recording.topics.model_copy()
+    topics._cameras = roles
+    return recording.model_copy(update={"topics": topics})
 
 
 def config_type() -> type[Config]:
@@ -680,11 +830,13 @@ def with_value(config: Config, key: str, value: Any) -> Config:
     Raises:
         pydantic.ValidationError: the value is wrong.
     """
-    section, name = key.removeprefix("expert.").split(".")
+    *sections, name = key.removeprefix("expert.").split(".")
     content = config.model_dump(mode="json", exclude_unset=True)
-    part = dict(content.get(section, {}))
+    part = content
+    for section in sections:
+        part = part.setdefault(section, {})
     part[name] = {**part.get(name, {}), **value} if isinstance(value, dict) else value
-    return config_of(content | {section: part})
+    return config_of(content)
 
 
 def setting(key: str) -> str:
@@ -721,6 +873,9 @@ def yaml_of(config: Config, folder: Path) -> str:
         path = getattr(getattr(config, section), key)
         if path is not None:
             data[section][key] = shipped_name(path) or os.path.relpath(path, folder)
+    for name, camera in config.cameras.items():
+        if camera.file is not None:
+            data["cameras"][name]["file"] = os.path.relpath(camera.file, folder)
     return str(yaml.safe_dump(parted(data, type(config)), sort_keys=False, default_flow_style=None, width=110))
 
 
@@ -737,4 +892,8 @@ def load_config(path: Path) -> Config:
         part = settings.content.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and not part[key].startswith(SHIPPED):
             settings.content[section] = part | {key: path.parent / part[key]}
+    cameras = settings.content.get("cameras")
+    for camera in cameras.values() if isinstance(cameras, dict) else ():
+        if isinstance(camera, dict) and isinstance(camera.get("file"), str):
+            camera["file"] = path.parent / camera["file"]
     return settings.validated_in_parts(config_type())

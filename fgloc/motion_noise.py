@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import RobotFile, with_findings
-from fgloc.config import Config, NoiseDensity, config_of_file, setting
+from fgloc.config import Config, NoiseDensity, base_roles, config_of_file, setting
 from fgloc.errors import FglocError
 from fgloc.graph.contradictions import smoothed_within_priors
 from fgloc.graph.measurement_log import Keyframe
@@ -39,7 +39,7 @@ _ACCURACY = 0.1  # of the logarithms
 
 def with_motion_noise(robot: RobotFile, bag: Path, progress: Progress | None = None) -> RobotFile:
     """First settings of a robot, with the noise of its wheels where sightings determine it."""
-    if not {"image", "sightings"} & robot.roles.keys():
+    if not {"image", "sightings"} & base_roles(robot.roles):
         return robot
     try:
         config = config_of_file(yaml.safe_load(robot.text) or {})

@@ -7,6 +7,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, TypedDict
 
@@ -172,6 +173,7 @@ class Replay:
         self._events: EventFilter = options.get("events") or iter
         self._sightings: EventFilter = options.get("sightings") or iter
         self._image_rejections: Counter[str] = Counter()
+        self._image_role = partial(parts.config.recording.topics.role_on, base="image")
         self._first_ns: int | None = None
         self._first_step_ns: int | None = None
         self.first_pose_s: float | None = None
@@ -190,7 +192,7 @@ class Replay:
         if self._detector is None:
             gated = self._gated(self._sightings(events))
         else:
-            found = detect_stream(self._gated(events), self._detector, self._image_rejections)
+            found = detect_stream(self._gated(events), self._detector, self._image_rejections, self._image_role)
             gated = self._regated(self._sightings(found))
         for event in gated:
             self.activity.record(event.topic, event.stamp_ns)

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import contradiction_findings, contradictions, found_values, installation_found
-from fgloc.config import Config, Role
+from fgloc.config import Config, Role, base_role, base_roles
 from fgloc.diagnosis.mistakes import Mistakes, find_mistakes, unused_sightings
 from fgloc.errors import EstimatorError
 from fgloc.evaluation.report import write_results
@@ -59,7 +59,7 @@ class Outcome:
             unread_map(recording, parts.config) if parts.landmark_map is not None and not recording.problems else None
         )
         # All but images was compared before the run
-        seen_in_images = parts.diagnosis.findings() if wrong.checked and parts.camera is not None else ()
+        seen_in_images = parts.diagnosis.findings() if wrong.checked and parts.cameras else ()
         findings = [
             *note(
                 "map.unused", () if unread is None or parts.config.estimator.initial_pose else (unread,), Severity.ERROR
@@ -86,7 +86,9 @@ class Outcome:
 def _hints(recording: Recording, parts: Assembly, replay: Replay) -> list[str]:
     """Reasons why nothing was received, or no marker was found."""
     hints = [*replay.activity.missing()]
-    if parts.detector is not None and not any(parts.localizer.counts[kind] for kind in registry.detected_kinds()):
+    if parts.detector is not None and not any(
+        base_role(kind) in registry.detected_kinds() for kind, n in parts.localizer.counts.items() if n
+    ):
         hints = [*parts.detector.hints(recording)[0], *hints]
     return hints
 
@@ -198,7 +200,7 @@ def run(
         source=recording_path,
         found=found,
         installation=found_values(
-            parts.localizer.factors.installation, installed, parts.config, parts.camera, parts.landmark_map
+            parts.localizer.factors.installation, installed, parts.config, parts.cameras, parts.landmark_map
         ),
         cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
@@ -215,14 +217,16 @@ def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[E
     """Findings of a run whose figures mean nothing: of one pose, or of positions that nothing measures."""
     if len(estimates) < 2:
         yield Finding("run.short", "The recording gives a single pose: there is no trajectory.", Severity.ERROR)
-    elif not parts.sensors and {"odometry", "joints", "command", "image", "sightings"}.isdisjoint(roles):
+    elif not parts.sensors and {"odometry", "joints", "command", "image", "sightings"}.isdisjoint(base_roles(roles)):
         yield Finding(
             "motion.unmeasured",
             "Nothing in the recording measures how far the robot goes (no odometry, joint states or commands, and no "
             "landmarks): its positions mean nothing, only its turn is measured. Record the robot's odometry too.",
             Severity.ERROR,
         )
-    elif not parts.sensors and parts.config.motion.model is None and {"image", "sightings"}.isdisjoint(roles):
+    elif (
+        not parts.sensors and parts.config.motion.model is None and {"image", "sightings"}.isdisjoint(base_roles(roles))
+    ):
         whole_s = (estimates[-1].stamp_ns - estimates[0].stamp_ns) * 1e-9
         if parts.wheels.unknown_s > _MOTIONLESS * whole_s:
             yield Finding(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from fgloc.config import Config, Role
+from fgloc.config import CAMERA_ROLES, Config, Role, base_roles, camera_role
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, rpy_matrix
 from fgloc.recording.reader import Recording
@@ -72,8 +72,12 @@ class StreamFacts(HasFrames, Protocol):
         ...
 
     @property
-    def image_size(self) -> tuple[int, int] | None:
-        """Width and height of the first image that can be decoded; None if there is none."""
+    def firsts(self) -> Iterable[Event]:
+        """The first event of each kind on each topic."""
+        ...
+
+    def image_size(self, topic: str | None) -> tuple[int, int] | None:
+        """Width and height of the first image of a topic that can be decoded; None if there is none."""
         ...
 
     @property
@@ -106,24 +110,39 @@ class RecordingFacts:
     @cached_property
     def first(self) -> Mapping[type[Event], Event]:
         """The first event of each kind."""
-        return first_events(self._recording)
+        return _by_kind(self.firsts)
 
     @cached_property
-    def image_size(self) -> tuple[int, int] | None:
-        """Width and height of the first image near the beginning that can be decoded."""
+    def firsts(self) -> Iterable[Event]:
+        """The first event of each kind on each topic, from as far as it takes for each to have a message."""
+        return _firsts(self._recording)
+
+    def image_size(self, topic: str | None) -> tuple[int, int] | None:
+        """Width and height of the first image near the beginning of a topic that can be decoded."""
         some = (event for _, event in zip(range(_SCAN_EVENTS), self._recording.events(), strict=False))
-        return first_size(some)
+        return first_size(event for event in some if event.topic == topic)
 
 
 def first_events(recording: Recording) -> dict[type[Event], Event]:
     """The first event of each kind, from as far into the recording as it takes for every topic to have a message."""
-    found: dict[type[Event], Event] = {}
+    return _by_kind(_firsts(recording))
+
+
+def _firsts(recording: Recording) -> tuple[Event, ...]:
+    found: dict[tuple[type[Event], str], Event] = {}
     missing = set(recording.roles.values())
     for event in recording.events():
-        found.setdefault(type(event), event)
+        found.setdefault((type(event), event.topic), event)
         missing.discard(event.topic)
         if not missing:
             break
+    return tuple(found.values())
+
+
+def _by_kind(firsts: Iterable[Event]) -> dict[type[Event], Event]:
+    found: dict[type[Event], Event] = {}
+    for event in firsts:
+        found.setdefault(type(event), event)
     return found
 
 
@@ -158,7 +177,8 @@ class SensorSetup:
         config: all settings, as the run uses them.
         landmark_map: None: landmarks are estimated.
         detector: of markers; None: there are no images.
-        camera: calibrated and mounted; None: there are neither images nor corners.
+        cameras: calibrated and mounted, each with its name where there are several; empty: there are neither images
+            nor corners.
         T_base_sensor: ``(4, 4)`` place of a sensor that reports ranges or marker poses; None: the base, or not known.
         learned: motion model; None: none is used.
         imu_up: the base's z axis in the IMU's frame, see `mounted_up`; None: there is no gyro, or it is not used.
@@ -172,7 +192,7 @@ class SensorSetup:
     config: Config
     landmark_map: LandmarkMap | None
     detector: MarkerDetector | None
-    camera: Camera | None
+    cameras: tuple[Camera, ...]
     T_base_sensor: FloatArray | None
     learned: LearnedMotion | None
     imu_up: FloatArray | None
@@ -215,34 +235,36 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
             "No odometry, joint states or commands: between sightings the robot may have gone as far as a fifth of "
             "expert.gate.max_speed takes it."
         )
-    camera = _camera(facts, config) if "image" in facts.roles or _in_pixels(facts.first) else None
-    notes += camera.notes if camera is not None else ()
+    cameras = _cameras(facts, config)
+    notes += [note for camera in cameras for note in camera.notes]
+    kinds = base_roles(facts.roles)
     T_base_sensor = _sensor_pose(facts, config, notes)
     sensors = _sensors(facts, config, landmark_map)
     if sensors and landmark_map is None:
         landmark_map = _no_landmarks(facts, sensors)
-    if landmark_map is None and {"image", "sightings"} & set(facts.roles):
-        notes += _without_effect(config, "landmarks" if camera is None else "camera")
+    if landmark_map is None and {"image", "sightings"} & kinds:
+        for name in config.camera_names:
+            notes += _without_effect(config.of_camera(name), "camera" if cameras else "landmarks", name)
         config = resolved(config, landmark_map)
         notes.append(
             "No map: landmarks are estimated with the trajectory, by the whole-run estimator, and the first pose is "
             "the map's origin (online: until a loop closes, then poses already given stay as well as they can); "
             "for long runs build the map once with `fgloc map`."
         )
-    detector = configured_detector(config, landmark_map) if "image" in facts.roles else None
+    detector = configured_detector(config, landmark_map) if "image" in kinds else None
     imu_up = T_base_imu = None
     learned = learned_motion(config, lambda: mounted_up(facts, config, facts.first))
     if "imu" in facts.roles and config.gyro.use:
         imu_up = mounted_up(facts, config, facts.first)
         T_base_imu = mounted_imu(facts, config, facts.first)
-    sees = bool(sensors) or not {"image", "sightings"}.isdisjoint(facts.roles)
+    sees = bool(sensors) or not {"image", "sightings"}.isdisjoint(kinds)
     there = [one for one in config.recording.odometries if one.role in facts.roles]
     beside = tuple(BesideOdometry(one, config.gate, _frames(facts, config)) for one in there)
     return SensorSetup(
         config,
         landmark_map,
         detector,
-        camera,
+        cameras,
         T_base_sensor,
         learned,
         imu_up,
@@ -254,12 +276,12 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     )
 
 
-def _without_effect(config: Config, section: str) -> Iterator[str]:
+def _without_effect(config: Config, section: str, camera: str) -> Iterator[str]:
     """A sentence on the uncertainties of a sensor of landmarks that were given, where there is no map."""
     part = getattr(config, section)
     given = [key for key in _ESTIMATED[section] if key in part.model_fields_set and getattr(part, key) > 0.0]
     if given:
-        keys = ", ".join(f"{section}.{key}" for key in given)
+        keys = ", ".join(f"cameras.{camera}.{key}" if camera else f"{section}.{key}" for key in given)
         yield (
             f"Without a map {keys} has no effect: the sensor's constants are taken as they are configured, because "
             "landmarks that are estimated with them could be off alike. Build a map with `fgloc map`, then they are "
@@ -303,7 +325,7 @@ def _no_landmarks(facts: StreamFacts, sensors: Sequence[Sensor]) -> LandmarkMap:
     Raises:
         ConfigError: there are sightings, whose landmarks would make a frame of their own.
     """
-    seen = [role for role in ("image", "sightings") if role in facts.roles]
+    seen = [role for role in ("image", "sightings") if role in base_roles(facts.roles)]
     if seen:
         names = ", ".join(sensor.name for sensor in sensors)
         raise ConfigError(
@@ -346,6 +368,53 @@ def _in_pixels(first: Mapping[type[Event], Event]) -> bool:
     return any(isinstance(event, SightingsEvent) and event.in_pixels for event in first.values())
 
 
+def _cameras(facts: StreamFacts, config: Config) -> tuple[Camera, ...]:
+    """The cameras that have images or corners in a stream."""
+    found = []
+    for name in config.camera_names:
+        own = OneCamera(facts, name) if name else facts
+        if "image" not in own.roles and not ("sightings" in own.roles and _in_pixels(own.first)):
+            continue
+        camera = _camera(own, config.of_camera(name))
+        topics = tuple(own.roles[role] for role in ("image", "sightings") if role in own.roles)
+        found.append(replace(camera, name=name, topics=topics) if name else camera)
+    return tuple(found)
+
+
+class OneCamera:
+    """Facts of a stream as if it had one of its cameras alone; see `StreamFacts`."""
+
+    def __init__(self, facts: StreamFacts, name: str) -> None:
+        """Take the facts of the whole stream, and the name of the camera."""
+        own = {camera_role(name, role): role for role in CAMERA_ROLES}
+        self._facts = facts
+        self._name = name
+        self.name, self.topics, self.camera = facts.name, facts.topics, facts.camera
+        self.roles = {
+            own.get(role, role): topic for role, topic in facts.roles.items() if "/" not in role or role in own
+        }
+
+    @property
+    def frames(self) -> FrameTree:
+        """All transforms."""
+        return self._facts.frames
+
+    @property
+    def firsts(self) -> Iterable[Event]:
+        """The first event of each kind on each topic."""
+        others = {t for role, t in self._facts.roles.items() if "/" in role} - set(self.roles.values())
+        return [event for event in self._facts.firsts if event.topic not in others]
+
+    @property
+    def first(self) -> Mapping[type[Event], Event]:
+        """The first event of each kind."""
+        return _by_kind(self.firsts)
+
+    def image_size(self, topic: str | None) -> tuple[int, int] | None:
+        """Width and height of the first image of a topic that can be decoded."""
+        return self._facts.image_size(topic)
+
+
 def _camera(facts: StreamFacts, config: Config) -> Camera:
     if facts.camera is not None:
         return _fitting(facts.camera, facts, config)
@@ -368,7 +437,7 @@ def _camera(facts: StreamFacts, config: Config) -> Camera:
 
 def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
     """The camera as the configuration corrects it, for the size of the images."""
-    size = facts.image_size
+    size = facts.image_size(facts.roles.get("image"))
     if size is None or not camera.width or size == (camera.width, camera.height):
         return corrected(camera, config.camera)
     if not config.camera.rescale:

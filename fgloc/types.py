@@ -251,6 +251,13 @@ class Camera:
     T_base_cam: FloatArray  # (4, 4), cam is the optical frame: z forward, x right, y down
     frame_id: str = ""
     notes: tuple[str, ...] = ()  # what was assumed when the calibration was read
+    name: str = ""  # of one among several
+    topics: tuple[str, ...] = ()  # of its images, or of the corners found in them; empty: whatever there is
+
+
+def camera_of(cameras: Iterable[Camera], topic: str) -> Camera | None:
+    """Camera whose images or corners a topic has; None: none of them."""
+    return next((camera for camera in cameras if not camera.topics or topic in camera.topics), None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -560,7 +567,7 @@ class InstallationFound:
     mean: FloatArray  # (n,)
     cov: FloatArray  # (n, n)
     prior_cov: FloatArray  # (n, n)
-    camera: Camera | None  # of corners, as the run used it
+    cameras: tuple[Camera, ...]  # of corners, as the run used them
     seen_by: str  # role whose stamps the sightings have
     wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they had no messages
     settings: tuple[Setting, ...] = ()  # all but the map's

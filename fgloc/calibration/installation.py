@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from fgloc.assembly import Assembly
-from fgloc.config import Config, setting
+from fgloc.config import CAMERA_ROLES, Config, camera_role, setting
 from fgloc.frames import rotation_of, sensor_pose
 from fgloc.graph.contradictions import Contradiction, Rival
-from fgloc.graph.installation import MARKER, Installation, InstallationEstimate
+from fgloc.graph.installation import MARKER, Installation, InstallationEstimate, camera_block
 from fgloc.sensors import registry
 from fgloc.sensors.base import InstallationState
 from fgloc.sensors.cameras import pinhole
@@ -39,7 +39,7 @@ def found_values(
     installation: Installation,
     belief: InstallationEstimate,
     config: Config,
-    camera: Camera | None,
+    cameras: Sequence[Camera],
     landmark_map: LandmarkMap | None,
 ) -> Found:
     """Values with their sigmas, by name.
@@ -50,6 +50,7 @@ def found_values(
       (without a gyro: the wheels') their stamps are; ``sightings.range_scale``, ``.bearing_offset_rad``;
     - ``camera.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw`` [rad]: of its body axes in the base frame;
       ``camera.focal_scale``, ``.cx_px``, ``.cy_px``, ``.k1``, ``.k2``;
+      of several cameras ``cameras.front.x`` and so on;
     - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
     """
     motion = [row for made in registry.MOTION_INSTALLATIONS for row in made.found(config)]
@@ -57,10 +58,11 @@ def found_values(
         (row.name, row.parameter, row.at, row.gain) for s in registry.sensors() for row in getattr(s, "found", ())
     ]
     out = _values([*motion, *sensed, *_sighting_rows()], installation, belief)
-    if camera is not None and "camera" in installation.blocks:
-        first = installation.blocks["camera"][0]
-        out |= mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
-        out |= _values(_lens_rows(camera), installation, belief)
+    for camera in cameras:
+        if (block := camera_block(camera.name)) in installation.blocks:
+            first = installation.blocks[block][0]
+            out |= mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
+            out |= _values(_lens_rows(camera), installation, belief)
     for i in installation.landmarks if landmark_map is not None else ():
         place = landmark_map.landmarks[i].position.tolist()  # type: ignore[union-attr]
         rows = [(f"map.{i}.{axis}", f"map.{i}.{axis}_m", at, 1.0) for axis, at in zip("xyz", place, strict=True)]
@@ -93,14 +95,16 @@ def _sighting_rows() -> list[_Row]:
 
 def _lens_rows(camera: Camera) -> list[_Row]:
     k1, k2 = np.concatenate([camera.D, np.zeros(2)])[:2]
-    return [
-        ("camera.focal_scale", "camera.focal", 1.0, 1.0),
-        ("camera.cx_px", "camera.cx_px", float(camera.K[0, 2]), 1.0),
-        ("camera.cy_px", "camera.cy_px", float(camera.K[1, 2]), 1.0),
-        ("camera.k1", "camera.k1", float(k1), 1.0),
-        ("camera.k2", "camera.k2", float(k2), 1.0),
-        ("camera.time_offset_s", "camera.time_offset_s", 0.0, 1.0),
+    rows = [
+        ("focal_scale", "focal", 1.0),
+        ("cx_px", "cx_px", float(camera.K[0, 2])),
+        ("cy_px", "cy_px", float(camera.K[1, 2])),
+        ("k1", "k1", float(k1)),
+        ("k2", "k2", float(k2)),
+        ("time_offset_s", "time_offset_s", 0.0),
     ]
+    block = camera_block(camera.name)
+    return [(f"{block}.{name}", f"{block}.{parameter}", at, 1.0) for name, parameter, at in rows]
 
 
 def mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:
@@ -111,7 +115,7 @@ def mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:
     to_base = np.kron(np.eye(2), R)
     sigmas = np.sqrt(np.diag(to_base @ cov @ to_base.T))
     return {
-        f"camera.{axis}": (float(value), float(s))
+        f"{camera_block(camera.name)}.{axis}": (float(value), float(s))
         for axis, value, s in zip(_AXES, sensor_pose(moved, optical=True), sigmas, strict=True)
     }
 
@@ -140,7 +144,7 @@ def installation_found(parts: Assembly, roles: Container[str], belief: Installat
         belief.mean[:n],
         belief.cov[:n, :n],
         installation.prior().cov[:n, :n],
-        parts.camera,
+        parts.cameras,
         "image" if "image" in roles else "sightings",
         "joints" if source == "ticks" else source,
     )
@@ -160,7 +164,8 @@ def settings_found(found: InstallationFound, config: Config) -> tuple[Setting, .
     """
     state = InstallationState(found)
     motion, sightings = _of_motion(state, config), _of_sightings(state, config)
-    return (*motion, *sightings, *_of_camera(state, config, found.camera), *_clocks(state, config, found))
+    of_cameras = (s for camera in found.cameras for s in _of_camera(state, config, camera))
+    return (*motion, *sightings, *of_cameras, *_clocks(state, config, found))
 
 
 def _of_motion(state: InstallationState, config: Config) -> Iterator[Setting]:
@@ -176,29 +181,35 @@ def _of_sightings(state: InstallationState, config: Config) -> Iterator[Setting]
     yield from state.setting("landmarks.bearing_bias_rad", bias, bias + state.value(name), {name: 1.0})
 
 
-def _of_camera(state: InstallationState, config: Config, camera: Camera | None) -> Iterator[Setting]:
-    if camera is None or "camera.x_m" not in state.index:
+def _of_camera(state: InstallationState, config: Config, camera: Camera) -> Iterator[Setting]:
+    block = camera_block(camera.name)
+    if f"{block}.x_m" not in state.index:
         return
-    place = slice(state.index["camera.x_m"], state.index["camera.x_m"] + 6)
+    place = slice(state.index[f"{block}.x_m"], state.index[f"{block}.x_m"] + 6)
     at_first = mounting(camera, np.zeros(6), state.prior[place, place])
     now = mounting(camera, state.mean[place], state.cov[place, place])
     for axis in _AXES:
-        (at, prior), (value, sigma) = at_first[f"camera.{axis}"], now[f"camera.{axis}"]
-        yield Setting(f"camera.{axis}", at, value, sigma, prior)
-    scale = config.camera.focal_scale
-    found = scale * (1.0 + state.value("camera.focal"))
-    yield from state.setting("camera.focal_scale", scale, found, {"camera.focal": scale})
+        (at, prior), (value, sigma) = at_first[f"{block}.{axis}"], now[f"{block}.{axis}"]
+        yield Setting(f"{block}.{axis}", at, value, sigma, prior)
+    scale = config.of_camera(camera.name).camera.focal_scale
+    found = scale * (1.0 + state.value(f"{block}.focal"))
+    yield from state.setting(f"{block}.focal_scale", scale, found, {f"{block}.focal": scale})
     D = np.concatenate([camera.D, np.zeros(2)])
     given = {"cx_px": camera.K[0, 2], "cy_px": camera.K[1, 2]}
     if pinhole(camera) is camera:
         given |= {"k1": D[0], "k2": D[1]}
     for name, at in given.items():
-        key = f"camera.{name}"
+        key = f"{block}.{name}"
         yield from state.setting(key, float(at), float(at) + state.value(key), {key: 1.0})
 
 
 def _clocks(state: InstallationState, config: Config, found: InstallationFound) -> Iterator[Setting]:
     clocks = {"camera.time_offset_s": found.seen_by, "sightings.time_offset_s": found.seen_by}
+    for camera in found.cameras:
+        if camera.name:
+            clocks[f"{camera_block(camera.name)}.time_offset_s"] = camera_role(
+                camera.name, "image" if config.cameras[camera.name].image is not None else "sightings"
+            )
     clocks["wheels.time_offset_s"] = found.wheels
     for name, role in clocks.items():
         if not role:
@@ -207,8 +218,28 @@ def _clocks(state: InstallationState, config: Config, found: InstallationFound) 
         yield from state.setting(f"stamp_offset_s.{role}", given, given - state.value(name), {name: -1.0})
 
 
+def _of_one(settings: Iterable[Setting], name: str) -> Iterator[Setting]:
+    """Settings of one of several cameras, by their names in a configuration that has it alone."""
+    block, roles = f"{camera_block(name)}.", {camera_role(name, role): role for role in CAMERA_ROLES}
+    for s in settings:
+        role = s.name.removeprefix("stamp_offset_s.")
+        if s.name.startswith(block):
+            yield replace(s, name=f"camera.{s.name.removeprefix(block)}")
+        elif role in roles:
+            yield replace(s, name=f"stamp_offset_s.{roles[role]}")
+
+
 def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
     """The configuration with the values found and their sigmas; a sigma that was 0 stays so."""
+    for name in config.cameras:
+        alone = with_settings(config.of_camera(name), list(_of_one(settings, name)))
+        config = config.with_camera(name, alone)
+    of_cameras = {camera_role(name, role) for name in config.cameras for role in CAMERA_ROLES}
+    settings = [
+        s
+        for s in settings
+        if not s.name.startswith("cameras.") and s.name.removeprefix("stamp_offset_s.") not in of_cameras
+    ]
     changes: dict[str, dict[str, Any]] = {}
     by_name = {s.name: s for s in settings}
 
@@ -280,6 +311,7 @@ _UNITS |= dict.fromkeys(("radius", "track", "wheelbase", "half_sum", "ring", "ax
 def setting_unit(name: str) -> str:
     """Unit of a setting such as ``camera.cx_px``; "-" for a ratio."""
     section, _, key = name.partition(".")
+    key = key.rpartition(".")[2] if section == "cameras" else key
     named = section if section.startswith("stamp_offset") else key.removeprefix("drive.").rstrip("_0123456789")
     return _UNITS.get(named) or (_SUFFIXES.get(named.rpartition("_")[2], "-") if "_" in named else "-")
 
@@ -410,7 +442,7 @@ def _lines(settings: Sequence[Setting]) -> dict[str, str]:
         section, _, key = s.name.partition(".")
         if section == "stamp_offset_s":
             lines["recording.stamp_offset_s"] = f"{{{key}: {s.found:.3f}}}"
-        elif key not in _AXES:
+        elif s.name.rpartition(".")[2] not in _AXES:
             lines[setting(s.name)] = f"{s.found:.5g}"
     return lines
 
@@ -448,8 +480,10 @@ def _is_clock(s: Setting) -> bool:
 
 
 def _line(s: Setting) -> str:
-    if s.name.partition(".")[2] in _AXES:
-        return "recording.sightings_pose, as the run's installation.yaml has it"
+    block, _, key = s.name.rpartition(".")
+    if key in _AXES:
+        place = "recording.sightings_pose" if block == "camera" else f"{block}.pose"
+        return f"{place}, as the run's installation.yaml has it"
     return f"{setting(s.name)}: {s.found:.5g}"
 
 

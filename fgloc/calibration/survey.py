@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import Found, found_values
-from fgloc.config import Config
+from fgloc.config import Config, base_roles
 from fgloc.errors import ConfigError, MapError, RecordingError
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
@@ -60,16 +61,18 @@ class Drive:
     sightings: Mapping[int, int]
     notes: tuple[str, ...]
 
-    def measure(self, sizes: Mapping[int, float], offset_s: float = 0.0) -> list[list[PixelMeasurement]]:
+    def measure(
+        self, sizes: Mapping[int, float], late_s: float | Callable[[str], float] = 0.0
+    ) -> list[list[PixelMeasurement]]:
         """Corners of these markers as seen from each keyframe.
 
         Args:
             sizes: side of each marker [m].
-            offset_s: how late the stamps of images are, as far as is known.
+            late_s: how late the stamps of images are, as far as is known, or a function that gives it by camera.
         """
         named = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), size) for i, size in sizes.items()})
         config = self.parts.config
-        sensor, wheels = LandmarkSensor(config, named, self.parts.camera, None), WheelMotion(config.wheels)
+        sensor, wheels = LandmarkSensor(config, named, self.parts.cameras, None), WheelMotion(config.wheels)
         motion = MotionSensors(wheels, gyro=self.parts.localizer.motion.sources.gyro)
         moved = MotionCompensation(PoseSensors(sensor), motion, config.camera.time_jitter_s)
         seen: list[list[PixelMeasurement]] = []
@@ -77,7 +80,7 @@ class Drive:
             found = []
             if frame.step is not None:
                 wheels.measure(frame.step)
-                found = corners_of(moved.measure(frame.step, offset_s))
+                found = corners_of(moved.measure(frame.step, late_s))
             seen.append([replace(m, sigma_px=m.sigma_px * _coarseness(m.corners_px)) for m in found])
         return seen
 
@@ -85,9 +88,9 @@ class Drive:
 def sees_corners(bag: Path, config: Config) -> bool:
     """Whether landmarks are seen as markers in images, or as their corners."""
     with open_recording(bag, config.recording) as recording:
-        if "image" in recording.roles:
+        if "image" in (kinds := base_roles(recording.roles)):
             return True
-        if "sightings" not in recording.roles:
+        if "sightings" not in kinds:
             return False
         first = next((e for e in recording.events() if isinstance(e, SightingsEvent)), None)
         return first is not None and first.in_pixels
@@ -153,9 +156,9 @@ def _checked(
 
 
 def _check(bag: Path, recording: Recording, config: Config) -> None:
-    if not {"image", "sightings"} & set(recording.roles):
+    if not {"image", "sightings"} & base_roles(recording.roles):
         raise RecordingError(f"{bag}: no images and no corners of markers: nothing to survey; see `fgloc info {bag}`")
-    if "image" in recording.roles and not config.markers.dictionary:
+    if "image" in base_roles(recording.roles) and not config.markers.dictionary:
         fitting = fitting_dictionary(recording)
         listed = (
             f"what is seen fits {fitting}: --dictionary {fitting}" if fitting else "such as --dictionary DICT_4X4_50"
@@ -608,7 +611,8 @@ class SurveyGraph:
 
     def _installation(self) -> Installation:
         has_gyro = any(leg.drive.parts.localizer.motion.sources.gyro is not None for leg in self._legs)
-        made = installation_of(self._config, self.landmark_map, True, has_gyro, len(self.landmark_map))
+        cameras = [camera.name for camera in self._legs[0].drive.parts.cameras]
+        made = installation_of(self._config, self.landmark_map, True, has_gyro, len(self.landmark_map), cameras=cameras)
         for d in self._distances:
             made.measured(self._along(d, made), d.metres - d.of(self.landmark_map.landmarks), d.sigma_m)
         return made
@@ -625,9 +629,9 @@ class SurveyGraph:
         """Keyframes of all drives, one after the other, with the corners seen from each."""
         log = MeasurementLog(math.inf, keep_all=True)
         sizes = {i: m.size_m for i, m in self.landmark_map.landmarks.items()}
-        offset_s = self.installation.time_offset(self.belief)
+        late_s = partial(self.installation.time_offset, self.belief)
         for leg in self._legs:
-            for n, (frame, seen) in enumerate(zip(leg.drive.frames, leg.drive.measure(sizes, offset_s), strict=True)):
+            for n, (frame, seen) in enumerate(zip(leg.drive.frames, leg.drive.measure(sizes, late_s), strict=True)):
                 k = len(log)
                 pose = self._poses[k]
                 prior = None
@@ -716,7 +720,7 @@ def survey(
     dictionary = config.markers.dictionary or (given.dictionary if given is not None else "")
     landmarks = LandmarkMap(dict(sorted((kept | unseen).items())), dictionary, "surveyed")
     first = drives[0].parts
-    found = found_values(graph.installation, graph.belief, first.config, first.camera, graph.landmark_map)
+    found = found_values(graph.installation, graph.belief, first.config, first.cameras, graph.landmark_map)
     notes = [note for one in drives for note in one.notes]
     notes += [f"Markers {sorted(unseen)} of the given map were not seen, and stay as given."] if unseen else []
     misfits = [(d, graph.misfit(d)) for d in distances]

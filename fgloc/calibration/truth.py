@@ -215,9 +215,9 @@ class _Fit:
         n = len(self._names)
         prior = np.diag(self._prior[:n] ** 2)
         state = InstallationState(
-            InstallationFound(tuple(self._names), np.zeros(n), self._cov[:n, :n], prior, None, "", "joints")
+            InstallationFound(tuple(self._names), np.zeros(n), self._cov[:n, :n], prior, (), "", "joints")
         )
-        given = InstallationState(InstallationFound(tuple(self._names), np.zeros(n), prior, prior, None, "", "joints"))
+        given = InstallationState(InstallationFound(tuple(self._names), np.zeros(n), prior, prior, (), "", "joints"))
         before = {s.name: s.given for s in INSTALLATION.settings(given, self._given)}
         made = [
             Setting(s.name, before[s.name], s.found, s.sigma, s.prior_sigma)
@@ -277,7 +277,7 @@ class _Fit:
     def _move(self, step: FloatArray) -> None:
         n = len(self._names)
         state = InstallationState(
-            InstallationFound(tuple(self._names), step[:n], np.eye(n), np.eye(n), None, "", "joints")
+            InstallationFound(tuple(self._names), step[:n], np.eye(n), np.eye(n), (), "", "joints")
         )
         values = {s.name.removeprefix("wheels."): s.found for s in INSTALLATION.settings(state, self.config)}
         try:

@@ -36,7 +36,7 @@ def init(
     if out.exists() and not force:
         raise OutputError(f"{out}: is there already; give another --out, or --force to replace it")
     from fgloc.calibration.first_settings import first_settings
-    from fgloc.config import load_config
+    from fgloc.config import base_roles, load_config
     from fgloc.files.outputs import write_text
     from fgloc.motion_noise import with_motion_noise
     from fgloc.recording.storage import find_beside
@@ -56,7 +56,7 @@ def init(
     next_step(f"fgloc info {shown_path(bag)} --config {shown_path(out)}", "check the recording with it")
     if not {"odometry", "joints", "command", "imu"} & found.roles.keys():
         raise typer.Exit(1)  # no run is possible
-    if not {"image", "sightings"} & found.roles.keys():
+    if not {"image", "sightings"} & base_roles(found.roles):
         return  # nothing to survey, or to calibrate on
     beside = find_beside(bag, "map.yaml")
     if beside is None:

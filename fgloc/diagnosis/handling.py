@@ -277,7 +277,7 @@ class FloorWatch:
         for event in step.sightings:
             if event.stamp_ns < self._looked_ns + _EVERY_NS or not event.in_pixels:
                 continue
-            seen = corners_of(self._landmarks.measure(event))
+            seen = corners_of(self._landmarks.measure(event))  # of one image, so of one camera
             known = [(m.corners_px, landmark_map.landmarks[m.landmark_id]) for m in seen]
             up = up_in_base(seen[0].camera, known) if len(known) > 1 else None
             if up is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config, Role
+from fgloc.config import CAMERA_ROLES, Config, Role, base_role, camera_role
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.handling import FloorWatch
 from fgloc.diagnosis.landmarks import first_pose_sentence
@@ -46,6 +46,7 @@ from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severit
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
 _FEWEST_IMAGES = 5
 _MOST_READINGS = 3  # of the recording, with stamps or mountings corrected in between
+_OF_CAMERA = ("camera", "markers", "setup", "sightings")  # of codes of findings on what a camera sees
 _MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the place is known
 
 
@@ -84,13 +85,56 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
     Raises:
         FglocError: the input cannot be used, as `fgloc.runner.run` would raise too.
     """
-    found = _Search(path, map_path, config)
-    found.run()
-    undone = found.config != config or found.landmark_map is not None
-    findings = found.findings
+    findings: list[Finding] = []
+    now, landmark_map = config, None
+    for name in _seeing(path, config):
+        found = _Search(path, map_path, now.of_camera(name), landmark_map)
+        found.run()
+        findings += of_camera(found.findings, name)
+        now, landmark_map = now.with_camera(name, found.config), found.landmark_map
+    undone = now != config or landmark_map is not None
     if undone and any(finding.severity is Severity.ERROR for finding in findings):
         findings += note("setup.corrected", ["This run was made with that corrected; correct it, too."])
-    return Mistakes(tuple(findings), found.config, found.landmark_map, undone, checked=True)
+    return Mistakes(tuple(findings), now, landmark_map, undone, checked=True)
+
+
+def _seeing(path: Path, config: Config) -> tuple[str, ...]:
+    """Names of the cameras that a recording has something of; ("",) where there are not several."""
+    if not config.cameras:
+        return ("",)
+    with open_recording(path, config.recording) as recording:
+        roles = recording.roles
+    return tuple(
+        name for name in config.cameras if {camera_role(name, r) for r in ("image", "sightings")} & roles.keys()
+    )
+
+
+def of_camera(findings: Iterable[Finding], name: str) -> list[Finding]:
+    """Findings of a configuration with one of several cameras, by the keys that the configuration of all has."""
+    if not name:
+        return list(findings)
+    keys = {
+        "expert.camera.": f"cameras.{name}.",
+        "camera.file": f"cameras.{name}.file",
+        "recording.sightings_pose": f"cameras.{name}.pose",
+        "recording.sightings_axes": f"cameras.{name}.axes",
+        **{f"recording.topics.{role}": f"cameras.{name}.{role}" for role in CAMERA_ROLES},
+        **{f"{{{role}: ": f"{{{name}/{role}: " for role in CAMERA_ROLES},
+        **{f"[{role}]": f"[{name}/{role}]" for role in CAMERA_ROLES},
+    }
+
+    def renamed(text: str) -> str:
+        for key, own in keys.items():
+            text = text.replace(key, own)
+        return text
+
+    made = []
+    for finding in findings:
+        text, lines = renamed(finding.text), {renamed(k): renamed(v) for k, v in finding.lines.items()}
+        if text != finding.text or lines != finding.lines or finding.code.split(".")[0] in _OF_CAMERA:
+            text = f"Camera {name}: {text[0].lower()}{text[1:]}"
+        made.append(replace(finding, text=text, lines=lines))
+    return made
 
 
 def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingInfo:
@@ -99,6 +143,14 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
     Raises:
         RecordingError: nothing can be read.
     """
+    if len(config.cameras) > 1:
+        with Recording(path, config.recording) as recording:
+            info = inspect_recording(recording, config)
+        try:
+            found = () if info.problems else find_mistakes(path, map_path, config).findings
+        except FglocError as error:
+            return replace(info, problems=(str(error), *info.problems))
+        return replace(info, found=ordered([*found, *info.found]))
     search = _Search(path, map_path, config)
     with Recording(path, config.recording) as recording:
         if recording.problems:
@@ -120,10 +172,12 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
 class _Search:
     """One search: reads the excerpt, again where a mistake of clocks or dictionary made it useless."""
 
-    def __init__(self, path: Path, map_path: Path | None, config: Config) -> None:
+    def __init__(
+        self, path: Path, map_path: Path | None, config: Config, landmark_map: LandmarkMap | None = None
+    ) -> None:
         self._path, self._map_path = path, map_path
         self.config = self._given = config
-        self.landmark_map: LandmarkMap | None = None
+        self.landmark_map = self._begun_with = landmark_map
         self._setup: list[Finding] = []
         self._conventions: list[Finding] = []
         self._compared = False
@@ -141,7 +195,7 @@ class _Search:
 
     def begin(self, recording: Recording) -> tuple[SensorSetup, RememberedDetections | None]:
         """The sensors as configured, and a detector that remembers what it finds in the excerpt."""
-        setup = recorded_setup(recording, self._map_path, self.config)
+        setup = recorded_setup(recording, self._map_path, self.config, self._begun_with)
         if setup.detector is None:
             return setup, None
         memory = setup.detector.remembering(setup.detector.following(), None, self.detections)
@@ -212,9 +266,10 @@ class _Search:
         return fitting is not None
 
     def _fit(self, recording: Recording, excerpt: Excerpt, parts: SensorSetup) -> None:
-        landmark_map, camera = parts.landmark_map, parts.camera
-        if camera is None or landmark_map is None:
+        landmark_map = parts.landmark_map
+        if not parts.cameras or landmark_map is None:
             return
+        (camera,) = parts.cameras
         image: Role = "image" if parts.detector is not None else "sightings"
         up = base_up(recording, self.config)
         before, apart = self.config, [f for f in self._conventions if f.code in ("wheels.turn", "wheels.scale")]
@@ -252,8 +307,7 @@ class _Search:
         self, excerpt: Excerpt, parts: SensorSetup, up: FloatArray | None
     ) -> Iterator[tuple[Finding, LandmarkMap]]:
         """Unit, mirror image or shifted ids of the map, by the markers' places that images show; the map without it."""
-        camera, landmark_map = parts.camera, parts.landmark_map
-        assert camera is not None
+        (camera,), landmark_map = parts.cameras, parts.landmark_map
         assert landmark_map is not None
         config = with_values(self.config, "recording", {"sightings_axes": "optical"})
         sensor = LandmarkSensor(config, landmark_map, camera, None)  # what it refuses does not count
@@ -438,6 +492,71 @@ class Diagnosis:
             yield replace(finding, text=text, lines={}, severity=severity)
 
 
+class Diagnoses:
+    """`Diagnosis` of each of several cameras, with the same signals of motion."""
+
+    def __init__(self, named: Mapping[str, Diagnosis], topics: Mapping[str, str]) -> None:
+        """Take the diagnosis of each camera by its name, and the camera of each topic."""
+        self._named, self._topics = named, topics
+
+    @property
+    def found(self) -> tuple[Finding, ...]:
+        """Findings of all, each once."""
+        return ordered([f for name, one in self._named.items() for f in of_camera(one.found, name)])
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """Sentences on errors of the configuration that make the poses wrong."""
+        return tuple(dict.fromkeys(m for one in self._named.values() for m in one.mistakes))
+
+    def add(self, event: Event) -> None:
+        """Store the signals of an event: of a camera with its own, of all else with each."""
+        of = self._topics.get(event.topic)
+        for name, one in self._named.items():
+            if of in (None, name):
+                one.add(event)
+
+    def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
+        """Watch the floor over a step; see `Diagnosis.observe`."""
+        for one in self._named.values():
+            one.observe(step, by_hand, motion)
+
+    def findings(self, ended: bool = True) -> tuple[Finding, ...]:
+        """Findings of all; see `Diagnosis.findings`."""
+        comparison = self.comparison(ended)
+        if comparison is not None:
+            comparison()
+        return self.found
+
+    def comparison(self, ended: bool = False) -> Callable[[], None] | None:
+        """A comparison of all whose is due; see `Diagnosis.comparison`."""
+        due = [c for one in self._named.values() if (c := one.comparison(ended)) is not None]
+
+        def compare() -> None:
+            for one in due:
+                one()
+
+        return compare if due else None
+
+
+def diagnosis_of(
+    config: Config,
+    landmark_map: LandmarkMap | None,
+    cameras: Sequence[Camera],
+    T_base_sensor: FloatArray | None,
+    imu_up: FloatArray | None,
+    floor: FloorWatch | None,
+) -> Diagnosis | Diagnoses:
+    """Diagnosis of a run with these cameras; the arguments are those of `Diagnosis`."""
+    if not any(camera.name for camera in cameras):
+        return Diagnosis(config, landmark_map, cameras[0] if cameras else None, T_base_sensor, imu_up, floor)
+    named: dict[str, Diagnosis] = {}
+    for camera in cameras:
+        own = config.of_camera(camera.name)
+        named[camera.name] = Diagnosis(own, landmark_map, camera, T_base_sensor, imu_up, None if named else floor)
+    return Diagnoses(named, {topic: camera.name for camera in cameras for topic in camera.topics})
+
+
 # --- After a run ------------------------------------------------------------------------------------------------------
 
 _CLOCK_REASONS = ("late", "future", "stray", "stamp_zero", "duplicate", "duplicate_stamp")
@@ -451,10 +570,11 @@ def unused_sightings(rejections: Mapping[str, int], roles: Mapping[Role, str], u
         roles: topics in use.
         used: sightings that the estimator was given, whatever it made of them.
     """
-    role: Role = "image" if "image" in roles else "sightings"
-    if used or role not in roles:
+    seeing = [role for kind in ("image", "sightings") for role in roles if base_role(role) == kind]
+    if used or not seeing:
         return ()
-    dropped = {k: n for k, n in rejections.items() if k.split(".")[0] in ("sightings", "image") and n}
+    role = seeing[0]
+    dropped = {k: n for k, n in rejections.items() if base_role(k.split(".")[0]) in ("sightings", "image") and n}
     by_clock = {k: n for k, n in dropped.items() if k.split(".", 1)[1] in _CLOCK_REASONS}
     if 2 * sum(by_clock.values()) <= sum(dropped.values()):
         return ()

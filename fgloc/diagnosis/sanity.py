@@ -42,6 +42,7 @@ from fgloc.types import (
     Severity,
     Step,
     Trajectory,
+    camera_of,
 )
 
 _WINDOW_S = 2.0  # wheels are good to a percent over it, and a pose jumps at most once
@@ -151,7 +152,7 @@ class Sanity:
         self,
         config: Config,
         landmark_map: LandmarkMap | None,
-        camera: Camera | None,
+        cameras: Sequence[Camera],
         T_base_sensor: FloatArray | None,
         wheels: WheelMotion,
         gyro: Gyro | None,
@@ -161,14 +162,14 @@ class Sanity:
         Args:
             config: as the run uses it.
             landmark_map: the known map; None if landmarks are estimated.
-            camera: of corners; None if there is none.
+            cameras: of corners.
             T_base_sensor: ``(4, 4)`` of a sensor that reports ranges or marker poses, as `LandmarkSensor` takes it.
             wheels: the run's.
             gyro: one of its own, whose bias only rest corrects; None: there is none.
         """
-        place = camera.T_base_cam if camera is not None else T_base_sensor
-        self._place: FloatArray = np.eye(4) if place is None else np.asarray(place, dtype=float)
-        sensor = LandmarkSensor(config, landmark_map, camera, T_base_sensor)
+        self._cameras = tuple(cameras)
+        self._place: FloatArray = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
+        sensor = LandmarkSensor(config, landmark_map, cameras, T_base_sensor)
         self._collector = SightingCollector(config, landmark_map, sensor, self._place)
         self._config, self._wheels, self._gyro = config, wheels, gyro
         self._landmarks = None
@@ -224,8 +225,10 @@ class Sanity:
             if abs(event.stamp_ns - self._last_seen_ns) < _SPARSE_NS:
                 continue
             self._last_seen_ns = event.stamp_ns
+            camera = camera_of(self._cameras, event.topic)
+            T = self._place if camera is None else camera.T_base_cam
             for sighting in self._collector.sightings(event, 0.0):
-                place = (self._place[:3, :3] @ sighting.point + self._place[:3, 3])[:2]
+                place = (T[:3, :3] @ sighting.point + T[:3, 3])[:2]
                 sigma = math.hypot(sighting.sigma_m, sighting.sigma_rad * math.hypot(place[0], place[1]))
                 yield event.stamp_ns, sighting.landmark_id, place, sigma
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, base_role
 from fgloc.diagnosis.signals import IMAGES, SignalCollector, Signals, take
 from fgloc.graph.installation import CAMERA, Installation, installation_of
 from fgloc.graph.observation import CornerBatch
@@ -112,7 +112,7 @@ def read_excerpt(recording: Recording, config: Config, detector: Detector | None
         detector: of markers; None: the recording holds corners.
     """
     collector = ExcerptCollector(recording, config, detector)
-    take(recording, [role for role in recording.roles if role not in IMAGES], collector.add)
+    take(recording, [role for role in recording.roles if base_role(role) not in IMAGES], collector.add)
     if "image" in recording.roles:
         take(recording, ["image"], lambda event: collector.add(event) and not collector.pictured)
     return collector.found

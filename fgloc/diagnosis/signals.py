@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config, Role
+from fgloc.config import Config, Role, base_role, base_roles
 from fgloc.frames import quaternion_yaw
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
@@ -235,7 +235,7 @@ class SignalCollector:
             config: with the bounds of what is plausible; distances may be in any unit.
             roles: topics, to note what passes between stamp and receipt; None: that is not noted.
         """
-        self.found = Signals(images="image" in (roles or {}))
+        self.found = Signals(images="image" in base_roles(roles or ()))
         self._role_of = {topic: role for role, topic in (roles or {}).items()}
         any_unit = dict.fromkeys(("max_range", "max_position"), _FARTHEST)
         self._gate = EventValidator(reported_bounds(config).model_copy(update=any_unit))
@@ -298,7 +298,7 @@ class SignalCollector:
 def read_signals(recording: Recording, config: Config) -> Signals:
     """Signals of a recording's beginning, without its images."""
     collector = SignalCollector(config, recording.roles)
-    take(recording, [role for role in recording.roles if role not in IMAGES], collector.add)
+    take(recording, [role for role in recording.roles if base_role(role) not in IMAGES], collector.add)
     return collector.found
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, base_role
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation.judgements import Judgement, judgements
 from fgloc.results import RunData
@@ -241,15 +241,15 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
         dropped[reason.partition(".")[0]] += count
     most = max((topic.count for topic in result.spans.values()), default=0)
     for sensor, count in dropped.most_common():
-        if sensor not in _SETTINGS:
+        if (kind := base_role(sensor)) not in _SETTINGS:
             continue
-        received = keyframes if sensor in ("image", "sightings") else most
+        received = keyframes if kind in ("image", "sightings") else most
         if count >= _FEWEST and count > _MOST_DROPPED * max(received, count):
             reasons = ", ".join(f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}."))
             too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
             unit = " Angles that change so fast are ticks or degrees, not radians." if 2 * too_fast > count else ""
             used = sensor not in _MOTION or result.found is None or result.found.wheels in ("", sensor)
-            remedy = f"look at {_SETTINGS[sensor]}" if used else "the run's motion is of another source"
+            remedy = f"look at {_SETTINGS[kind]}" if used else "the run's motion is of another source"
             yield Finding(
                 f"{sensor}.dropped",
                 f"{count} messages of {sensor} were dropped ({reasons}); {remedy}.{unit}",

@@ -152,7 +152,7 @@ def key_in_file(key: str, model: type[Section]) -> str:
     inner = model
     for part in outer:
         section = section_of(inner.model_fields[part])
-        if section is None:  # one of several sections, such as a drive, whose keys are all the user's
+        if section is None:  # one of several sections, such as a drive or a camera, whose keys are all the user's
             return key
         inner = section
     field = inner.model_fields[last]

@@ -753,6 +753,7 @@ def make_estimator(
         has_gyro=motion.gyro is not None,
         has_model=motion.learned is not None,
         sensed=[parameter for sensor in poses.registered for parameter in getattr(sensor, "parameters", ())],
+        cameras=poses.landmarks.camera_names or ("",),
     )
     kind = ExtendedKalmanFilter if config.estimator.kind == "ekf" else IncrementalEstimator
     return kind(config.estimator, LandmarkFactors(landmark_map, installation), keep_all)

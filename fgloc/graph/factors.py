@@ -239,10 +239,9 @@ class LandmarkFactors:
         self._estimated = belief
         self._remembered = np.zeros(3), {}
 
-    @property
-    def time_offset_s(self) -> float:
-        """How late stamps of sightings are, as far as is known."""
-        return self.installation.time_offset(self.estimated)
+    def time_offset_s(self, camera: str = "") -> float:
+        """How late stamps of sightings are, as far as is known; of several cameras those of one."""
+        return self.installation.time_offset(self.estimated, camera)
 
     @property
     def known(self) -> bool:

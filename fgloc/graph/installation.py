@@ -30,14 +30,18 @@ LENGTH, HEADING, TURN = "length", "heading", "turn"
 # What constants of sightings change alike: distances, the direction of landmarks while the robot turns, the turn
 _EFFECTS = {
     "sightings.range_scale": (LENGTH,),
-    "camera.focal": (LENGTH,),
     "sightings.bearing_offset_rad": (HEADING,),
     "sightings.time_offset_s": (HEADING,),
-    "camera.ry_rad": (HEADING,),
-    "camera.time_offset_s": (HEADING,),
 }
+_EFFECTS_OF_CAMERA = {"focal": (LENGTH,), "ry_rad": (HEADING,), "time_offset_s": (HEADING,)}
 _GROUND_SIGMAS = (0.3, 0.15, 0.15)  # m, rad, rad: of a robot somewhere on an uneven floor; ramps of 15° are 0.26 rad
-TIME_OFFSET = {"camera": 11, "sightings": 2}  # row of the clock within its block
+_SENSORS = ("camera", "cameras", "sightings")  # first part of the names of parameters of what sees landmarks
+_CLOCK_OF_CAMERA, _CLOCK_OF_SIGHTINGS = 11, 2  # row of the clock within its block
+
+
+def camera_block(name: str) -> str:
+    """Block of a camera's parameters: ``camera``; ``cameras.front`` of one of several."""
+    return f"cameras.{name}" if name else "camera"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,9 +59,9 @@ class Installation:
     marker's translation is in the map frame, its rotation in its own.
 
     Attributes:
-        names: ``section.parameter``, of markers ``map.ID.parameter``.
+        names: ``section.parameter``, of markers ``map.ID.parameter``, of several cameras ``cameras.NAME.parameter``.
         sigmas: ``(n,)`` of the prior.
-        blocks: rows ``(first, count)`` of "camera" and "sightings", where there are such.
+        blocks: rows ``(first, count)`` of `camera_block` and "sightings", where there are such.
         landmarks: likewise, by id; 6 rows for a marker seen by its corners, else 2.
         ground: on uneven ground the last three rows are `GROUND`: height, roll and pitch of the base. They are of the
             newest pose; in the graph each keyframe has its own.
@@ -98,9 +102,10 @@ class Installation:
             if section == "map":
                 first, count = self.landmarks.get(int(rest[0]), (i, 0))
                 self.landmarks[int(rest[0])] = (first, count + 1)
-            elif section in TIME_OFFSET:
-                first, count = self.blocks.get(section, (i, 0))
-                self.blocks[section] = (first, count + 1)
+            elif section in _SENSORS:
+                block = _block(name)
+                first, count = self.blocks.get(block, (i, 0))
+                self.blocks[block] = (first, count + 1)
         self.ground = self.names[-len(GROUND) :] == GROUND
         self.constants = len(kept) - len(GROUND) * self.ground
         self._prior_cov = np.diag(np.maximum(sigmas, _HELD) ** 2)
@@ -184,18 +189,22 @@ class Installation:
         cov = self._prior_cov - np.outer(gain, row @ self._prior_cov)
         self._prior_cov = 0.5 * (cov + cov.T)
 
-    def time_offset(self, belief: InstallationEstimate) -> float:
-        """How much later than the exposure the stamps of the sightings are, as far as is known [s]."""
-        for section, row in TIME_OFFSET.items():
-            if section in self.blocks:
-                return float(belief.mean[self.blocks[section][0] + row])
+    def time_offset(self, belief: InstallationEstimate, camera: str = "") -> float:
+        """How much later than the exposure the stamps of the sightings are, as far as is known [s].
+
+        Args:
+            belief: of the installation.
+            camera: name of the one that they are of, among several.
+        """
+        for block, row in ((camera_block(camera), _CLOCK_OF_CAMERA), ("sightings", _CLOCK_OF_SIGHTINGS)):
+            if block in self.blocks:
+                return float(belief.mean[self.blocks[block][0] + row])
         return 0.0
 
 
 def _block(name: str) -> str:
     """Name of the block that a parameter belongs to; "" for a single one, which is a state if its sigma is not 0."""
-    section = name.split(".")[0]
-    return name.rpartition(".")[0] if section == "map" else section if section in TIME_OFFSET else ""
+    return name.rpartition(".")[0] if name.split(".")[0] in ("map", *_SENSORS) else ""
 
 
 _UNSEEN = 1e-6  # share of its variance by which measurements make a constant surer that they say nothing of
@@ -211,6 +220,7 @@ def installation_of(
     most: int = MOST_LANDMARKS,
     has_model: bool = True,
     sensed: Sequence[Parameter] = (),
+    cameras: Sequence[str] = ("",),
 ) -> Installation:
     """The parameters of a run, with their priors.
 
@@ -225,22 +235,27 @@ def installation_of(
         most: landmarks of a map that are states; a larger map is taken as exact.
         has_model: whether there is a learned motion.
         sensed: parameters of registered sensors.
+        cameras: names of the cameras that see corners.
     """
-    camera, rb = config.camera, config.landmarks
+    rb = config.landmarks
     there = {"wheels": True, "gyro": has_gyro, "learned": has_model}
     roles = [role for role, is_there in there.items() if is_there]
     parameters = (*registry.motion_parameters(config, roles), *sensed)
     sigmas = {parameter.name: parameter.sigma for parameter in parameters}
-    effects = _EFFECTS | {parameter.name: parameter.effects for parameter in parameters}
+    effects: dict[str, tuple[str, ...]] = dict(_EFFECTS)
+    effects |= {f"{camera_block(c)}.{name}": e for c in cameras for name, e in _EFFECTS_OF_CAMERA.items()}
+    effects |= {parameter.name: parameter.effects for parameter in parameters}
     length = [parameter.name for parameter in parameters if parameter.lengthens]
     ground = dict(zip(GROUND, _GROUND_SIGMAS, strict=True)) if config.estimator.ground == "uneven" else {}
     if landmark_map is None:
         return Installation(sigmas | ground, None, effects, length)
     if corners:
-        m, r = camera.position_sigma_m, camera.rotation_sigma_rad
-        focal, pp, k = camera.focal_sigma, camera.principal_sigma_px, camera.distortion_sigma
-        values = (m, m, m, r, r, r, focal, pp, pp, k, k, camera.time_offset_sigma_s)
-        sigmas |= {f"camera.{name}": v for name, v in zip(CAMERA, values, strict=True)}
+        for name in cameras:
+            camera = config.of_camera(name).camera
+            m, r = camera.position_sigma_m, camera.rotation_sigma_rad
+            focal, pp, k = camera.focal_sigma, camera.principal_sigma_px, camera.distortion_sigma
+            values = (m, m, m, r, r, r, focal, pp, pp, k, k, camera.time_offset_sigma_s)
+            sigmas |= {f"{camera_block(name)}.{key}": v for key, v in zip(CAMERA, values, strict=True)}
     else:
         sensor = (rb.range_scale_sigma, rb.bearing_bias_sigma_rad, rb.time_offset_sigma_s)
         sigmas |= {f"sightings.{name}": v for name, v in zip(SENSOR, sensor, strict=True)}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.frames import rotations
-from fgloc.graph.installation import Installation
+from fgloc.graph.installation import CAMERA, Installation, camera_block
 from fgloc.sensors.measurements import (
     MIN_DEPTH_M,
     FrameMeasurement,
@@ -157,12 +157,12 @@ class CornerBatch:
         self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
         self._noise_px = np.hypot(self._sigma, self._blur_px)
         self.rows = [8] * len(seen)
-        first = installation.blocks.get("camera")
-        self._camera = None if first is None else np.arange(first[0], first[0] + 12)
+        firsts = [installation.blocks.get(camera_block(m.camera.name)) for m in seen]
+        held_at = np.array([-1 if first is None else first[0] for first in firsts])
+        self._camera = np.where(held_at[:, None] >= 0, held_at[:, None] + np.arange(len(CAMERA)), -1)  # (m, 12)
         marker = np.array([landmark_block(installation, m.landmark_id, 6) for m in seen])
         self._columns = np.full((len(seen), 18), -1)
-        if self._camera is not None:
-            self._columns[:, :12] = self._camera
+        self._columns[:, :12] = self._camera
         self._columns[:, 12:] = np.where(marker[:, None] >= 0, marker[:, None] + np.arange(6), -1)
         self._constants = installation.constants
 
@@ -180,8 +180,8 @@ class CornerBatch:
 
     def _evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool) -> Stacked:
         n = len(poses)
-        camera = np.zeros(12) if self._camera is None else theta[self._camera]
-        marker = np.append(theta, 0.0)[self._columns[:, 12:]]
+        installed = np.append(theta, 0.0)[self._columns]
+        camera, marker = installed[:, :12], installed[:, 12:]
         # 1. Corners in the map, in the base frame, at the exposure, in the camera
         turned = _cross(marker[:, None, 3:], self._local)
         local = self._local + turned + 0.5 * _cross(marker[:, None, 3:], turned)
@@ -192,15 +192,15 @@ class CornerBatch:
             P[:, :, 2] -= poses[:, None, 3]
         q = P @ Rz
         flow = self._flow(q)
-        late = camera[11] - self._offset
+        late = camera[:, 11] - self._offset
         mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
-        X = mounted - camera[:3] - _cross(camera[3:6], mounted)
+        X = mounted - camera[:, None, :3] - _cross(camera[:, None, 3:6], mounted)
         behind = (X[:, :, 2] < MIN_DEPTH_M).any(axis=1)
         # 2. Image, with its derivatives by the point in the camera, (m, 4, 2, 3), and by the lens
         predicted, A, by_lens = self._project(X, camera, by_installation)
         # 3. Derivatives
         # by the point in the base frame at the exposure
-        B = (A - _cross(A, camera[3:6])) @ self._R.transpose(0, 2, 1)[:, None]
+        B = (A - _cross(A, camera[:, None, None, 3:6])) @ self._R.transpose(0, 2, 1)[:, None]
         by_time = (B @ flow[..., None])[..., 0]
         turn = (late * self._twist[:, 2])[:, None, None]
         B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
@@ -237,7 +237,7 @@ class CornerBatch:
         """Fill in derivatives by the marker, from those by a point in the map ``(m, 4, 2, 3)``; 0 what is no state."""
         H[..., 12:15] = M
         H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
-        H[..., :12] *= self._camera is not None
+        H[..., :12] *= (self._camera[:, 0] >= 0)[:, None, None, None]
         H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
 
     def _ground_in_installation(self, stack: Stacked, by_installation: bool) -> Stacked:
@@ -257,7 +257,7 @@ class CornerBatch:
 
         Args:
             X: ``(m, 4, 3)`` [m].
-            camera: ``(12,)`` what camera and clock are off by.
+            camera: ``(m, 12)`` what camera and clock are off by.
             with_lens: whether the derivatives by the lens are needed.
 
         Returns:
@@ -266,15 +266,15 @@ class CornerBatch:
         """
         Z = np.maximum(X[:, :, 2], MIN_DEPTH_M)
         x, y = X[:, :, 0] / Z, X[:, :, 1] / Z
-        k1, k2 = self._D[:, None, 0] + camera[9], self._D[:, None, 1] + camera[10]
+        k1, k2 = self._D[:, None, 0] + camera[:, None, 9], self._D[:, None, 1] + camera[:, None, 10]
         p1, p2 = self._D[:, None, 2], self._D[:, None, 3]
         r2 = x * x + y * y
         radial = 1.0 + k1 * r2 + k2 * r2 * r2
         xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
         yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        f = self._K[:, None, :2] * (1.0 + camera[6])
+        f = self._K[:, None, :2] * (1.0 + camera[:, None, 6:7])
         image = np.stack([xd, yd], axis=2)
-        predicted = f * image + self._K[:, None, 2:] + camera[7:9]
+        predicted = f * image + self._K[:, None, 2:] + camera[:, None, 7:9]
         dr = k1 + 2.0 * k2 * r2
         by_ray = np.empty((len(X), 4, 2, 2))
         by_ray[..., 0, 0] = radial + 2.0 * x * x * dr + 2.0 * p1 * y + 6.0 * p2 * x
@@ -287,7 +287,7 @@ class CornerBatch:
         if not with_lens:
             return predicted, A, None
         by_lens = np.empty((len(X), 4, 2, 5))
-        by_lens[..., 0] = f * image / (1.0 + camera[6])
+        by_lens[..., 0] = f * image / (1.0 + camera[:, None, 6:7])
         by_lens[..., 1:3] = np.eye(2)
         by_lens[..., 3] = f * np.stack([x, y], axis=2) * r2[..., None]
         by_lens[..., 4] = by_lens[..., 3] * r2[..., None]

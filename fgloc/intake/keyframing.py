@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from fgloc.config import GateConfig, KeyframesConfig
+from fgloc.config import GateConfig, KeyframesConfig, camera_role
 from fgloc.intake.clocks import ClockGuard, ClockNotes, ClockVerdict
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
@@ -146,7 +146,14 @@ class KeyframeBuilder:
     ``rejections`` counts by "sensor.reason" with the reasons late, duplicate and future.
     """
 
-    def __init__(self, config: KeyframesConfig, gate: GateConfig, lag_s: float, streams: Iterable[Stream] = ()) -> None:
+    def __init__(
+        self,
+        config: KeyframesConfig,
+        gate: GateConfig,
+        lag_s: float,
+        streams: Iterable[Stream] = (),
+        named: Mapping[str, str] | None = None,
+    ) -> None:
         """Start without events.
 
         Args:
@@ -154,6 +161,7 @@ class KeyframeBuilder:
             gate: what counts as a jump of the clock.
             lag_s: how late sightings may be and still be fused.
             streams: of registered sensors; their events go with the steps as sightings do.
+            named: name of the camera of a topic, where there are several.
         """
         self.rejections: Counter[str] = Counter()
         self._min_ns = max(int(config.min_interval_s * 1e9), 1)
@@ -164,6 +172,7 @@ class KeyframeBuilder:
         self._clock = ClockGuard(gate)
         self._streams = {stream.event: stream for stream in streams}
         self._clock_notes = ClockNotes()
+        self._named = named or {}
         self._index = 0
         self._segment = 0
         self._motion: dict[tuple[type[MotionEvent], str], EventBuffer[MotionEvent]] = {}  # by class of event and topic
@@ -280,7 +289,7 @@ class KeyframeBuilder:
 
     def _name(self, event: Event) -> str:
         """Name of an event's role, for the rejections."""
-        return self._roles[type(event)]
+        return camera_role(self._named.get(event.topic, ""), self._roles[type(event)])
 
     def _stray(self, event: Event) -> None:
         """An event far off the clock: a sighting may just be very late, the rest is lost."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from fgloc.config import Config, GateConfig
+from fgloc.config import Config, GateConfig, camera_role
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
 from fgloc.sensors.checks import EMPTIED, Changes, FieldChecks
@@ -69,7 +69,11 @@ class EventValidator:
     """
 
     def __init__(
-        self, config: GateConfig, known_ids: Collection[int] | None = None, streams: Iterable[Stream] = ()
+        self,
+        config: GateConfig,
+        known_ids: Collection[int] | None = None,
+        streams: Iterable[Stream] = (),
+        named: Mapping[str, str] | None = None,
     ) -> None:
         """Start without events.
 
@@ -77,11 +81,13 @@ class EventValidator:
             config: bounds.
             known_ids: ids of the map; None if no map is given: then every id passes.
             streams: of sensors of other packages; the built-in ones are known.
+            named: name of the camera of a topic, where there are several: its sensor is ``front/image`` then.
         """
         self.rejections: Counter[str] = Counter()
         self._config = config
         self._notes: dict[str, None] = {}  # an ordered set
-        self._parts = FieldChecks(config, self._note, self.rejections, known_ids)
+        self._parts = FieldChecks(config, self._note, self.rejections, known_ids, named)
+        self._named = named or {}
         self._seen: Counter[str] = Counter()  # events by role
         self._topics: dict[str, _Topic] = {}
         self._checks: dict[type, tuple[str, Callable[[Any], Event | str]]] = {TruthEvent: ("truth", self._truth)}
@@ -117,6 +123,8 @@ class EventValidator:
                 return None
             return checked
         sensor, check = entry
+        if event.topic in self._named:
+            sensor = camera_role(self._named[event.topic], sensor)
         self._seen[sensor] += 1
         topic = self._topics.get(event.topic)
         reason = self._stamp(event, topic)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
-from fgloc.config import Config, Role
+from fgloc.config import Config, Role, TopicsConfig
 from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.instrumentation import one_blas_thread
@@ -90,18 +90,20 @@ class DetectionWorker:
 
     Attributes:
         detector: what finds them; may be exchanged.
-        rejections: images that could not be decoded, as "image." and the reason.
+        rejections: images that could not be decoded, by role and reason.
         dropped: images dropped under overload.
         error: what ended the thread, if it was not `stop`.
     """
 
-    def __init__(self, changed: threading.Condition, most_waiting: int) -> None:
+    def __init__(self, changed: threading.Condition, most_waiting: int, topics: TopicsConfig) -> None:
         """Start the thread.
 
         Args:
             changed: notified whenever an image is done.
             most_waiting: images that may wait, from their arrival until the estimator has their markers.
+            topics: by which images are counted as those of one of several cameras.
         """
+        self._topics = topics
         use_one_thread()
         self.detector: Detector | None = None
         self.rejections: Counter[str] = Counter()
@@ -176,7 +178,7 @@ class DetectionWorker:
                 return self._wake()
             with self._changed:
                 if reason:
-                    self.rejections[f"image.{reason}"] += 1
+                    self.rejections[f"{self._topics.role_on(event.topic, 'image')}.{reason}"] += 1
                 image.event, image.state = found, State.GONE if found is None else State.READY
                 if found is None and image in self._images:
                     self._images.remove(image)
@@ -230,7 +232,8 @@ class Estimation:
         self._working = False
         self._closing = False
         self._failed: FglocError | None = None
-        self._worker = DetectionWorker(self._changed, config.live.image_queue)
+        self._topics = config.recording.topics
+        self._worker = DetectionWorker(self._changed, config.live.image_queue, self._topics)
         self._threads = [_started("estimation", self._estimate), _started("diagnosis", self._compare_regularly)]
         if self._state is not None:
             self._threads.append(_started("state", self._save_regularly))
@@ -255,7 +258,7 @@ class Estimation:
             while len(self._inbox) > _MOST_EVENTS:
                 lost = self._inbox.popleft()
                 if isinstance(lost, Queued) and lost.event is not None:
-                    self._dropped[role_name(lost.event)] += 1
+                    self._dropped[role_name(lost.event, self._topics)] += 1
                     self._worker.discard(lost)
             self._changed.notify_all()
 
@@ -401,7 +404,7 @@ class Estimation:
 
     def _refuse(self, item: Queued, event: Event) -> None:
         """Drop an event of another topic than the one that plays its role, with a note."""
-        role = role_name(event)
+        role = role_name(event, self._topics)
         with self._changed:
             if not self.run.facts.is_configured(event):
                 self._notes.setdefault(

@@ -110,6 +110,7 @@ class Reception:
 
     def __init__(self, config: Config) -> None:
         """Start without events."""
+        self._topics = config.recording.topics
         self._selection = LiveFacts(config, None, None)
         self._gate = EventValidator(reported_bounds(config))
         self.dropped: Counter[str] = Counter()
@@ -120,7 +121,7 @@ class Reception:
 
     def receive(self, event: Event, publisher: str) -> list[Event]:
         """Events that are to be used now: mostly this one; see `TopicClocks`."""
-        role = role_name(event)
+        role = role_name(event, self._topics)
         if event.topic not in self._meters and len(self._meters) >= _MOST_TOPICS:
             self.dropped[role] += 1
             self.note(f"more than {_MOST_TOPICS} topics: messages of further ones are not used")

@@ -27,6 +27,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from fgloc.config import TopicsConfig
 from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.engine import Estimation, LiveStatus, Settings
@@ -71,6 +72,7 @@ class EstimationProcess:
         self._urgent = False  # one of them is to be sent at once
         self._awaited_ns: int | None = None  # stamp of a sighting whose estimate has not come yet
         self._most_images = 0
+        self._topics = TopicsConfig()
         self._dropped: Counter[str] = Counter()
         self._numbers = itertools.count()
         self._asked: dict[int, Future[Any]] = {}
@@ -88,6 +90,7 @@ class EstimationProcess:
     def begin(self, settings: Settings, outlet: Outlet) -> None:
         """Set up the run; the arguments are those of `Estimation`."""
         self._most_images = settings.config.live.image_queue
+        self._topics = settings.config.recording.topics
         self._connection.send(settings)
         for name, work in (("send", self._send), ("receive", lambda: self._receive(outlet))):
             thread = threading.Thread(target=work, name=f"fgloc-{name}", daemon=True)
@@ -175,7 +178,7 @@ class EstimationProcess:
     def _drop(self, event: Event) -> None:
         self._waiting.remove(event)
         self._images -= isinstance(event, RawEvent)
-        self._dropped[role_name(event)] += 1
+        self._dropped[role_name(event, self._topics)] += 1
 
     def _ask(self, method: str, *arguments: Any) -> Future[Any]:
         """Call a method in the process; its answer comes after the results of everything queued before."""

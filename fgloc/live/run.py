@@ -10,7 +10,16 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble_stream
-from fgloc.config import ODOMETRIES, Config, Role, role_names
+from fgloc.config import (
+    CAMERA_ROLES,
+    ODOMETRIES,
+    Config,
+    Role,
+    TopicsConfig,
+    base_role,
+    camera_role,
+    role_names,
+)
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.live.extrapolation import Anchor, Anchors
 from fgloc.live.state import (
@@ -50,16 +59,18 @@ from fgloc.types import (
 # --- Facts of the stream, gathered from its first messages ------------------------------------------------------------
 
 
-def role_of(event: Event) -> Role | None:
-    """Role of an event's topic; None if it needs none."""
+def role_of(event: Event, topics: TopicsConfig) -> Role | None:
+    """Role of an event's topic, of one of several cameras by its topic; None if it needs none."""
     if isinstance(event, CameraInfoEvent | TruthEvent):
-        return "camera_info" if isinstance(event, CameraInfoEvent) else "truth"
-    return registry.role_of_event(event)
+        role: Role | None = "camera_info" if isinstance(event, CameraInfoEvent) else "truth"
+    else:
+        role = registry.role_of_event(event)
+    return role if role is None or role not in CAMERA_ROLES else topics.role_on(event.topic, role)
 
 
-def role_name(event: Event) -> str:
+def role_name(event: Event, topics: TopicsConfig) -> str:
     """Role of an event's topic; "tf" if it needs none."""
-    return role_of(event) or "tf"
+    return role_of(event, topics) or "tf"
 
 
 MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
@@ -88,8 +99,11 @@ class LiveFacts:
         self.roles: dict[Role, str] = {}
         self.left_out = 0
         self._seen: dict[type[Event], Event] = {}
-        self.image_size: tuple[int, int] | None = None
-        self.expected = None if expected is None else frozenset(expected) - _NOT_BUILT_FROM
+        self._firsts: dict[tuple[type[Event], str], Event] = {}
+        self._sizes: dict[str, tuple[int, int]] = {}  # of images, by topic
+        self.expected = (
+            None if expected is None else frozenset(r for r in expected if base_role(r) not in _NOT_BUILT_FROM)
+        )
         self._config = config
         self._topics: dict[Role, str] = {}  # the first topic of each role; others are not used
         self._transforms: dict[bool, dict[tuple[str, str], list[TransformEvent]]] = {False: {}, True: {}}  # by static
@@ -114,7 +128,7 @@ class LiveFacts:
     def _role_of(self, event: Event) -> Role | None:
         """Role of an event's topic, also of an odometry beside the wheels; None if it needs none."""
         beside = {topic: role for role, topic in self._config.recording.beside.items()}
-        return beside.get(event.topic) or role_of(event)
+        return beside.get(event.topic) or role_of(event, self._config.recording.topics)
 
     def _given(self, role: Role) -> str | None:
         """Topic that the configuration gives a role; "none": it is not to be used."""
@@ -126,14 +140,23 @@ class LiveFacts:
         """First event of each class whose role is there."""
         return {kind: event for kind, event in self._seen.items() if self.is_there(event)}
 
+    @property
+    def firsts(self) -> list[Event]:
+        """First event of each class on each topic whose role is there."""
+        return [event for event in self._firsts.values() if self.is_there(event)]
+
+    def image_size(self, topic: str | None) -> tuple[int, int] | None:
+        """Width and height of the first image of a topic that could be decoded; None: there is none yet."""
+        return self._sizes.get(topic or "")
+
     def is_there(self, event: Event) -> bool:
         """Whether everything is known that is needed to use an event."""
         role = self._role_of(event)
-        return role is None or role in _NOT_BUILT_FROM or role in self.roles
+        return role is None or base_role(role) in _NOT_BUILT_FROM or role in self.roles
 
     def is_news(self, event: Event) -> bool:
         """Whether the event may hold facts that the run is not yet built from."""
-        return self._incomplete or type(event) not in self._seen
+        return self._incomplete or (type(event), event.topic) not in self._firsts
 
     def note(self, event: Event) -> bool:
         """Add an event to the facts; whether a role is there now that was not before."""
@@ -141,22 +164,25 @@ class LiveFacts:
             self._add_transform(event)
         else:
             self._seen.setdefault(type(event), event)
-        if isinstance(event, RawEvent) and self.image_size is None:
-            self.image_size = event.decoded_size()
-            if self.image_size is None:
+            self._firsts.setdefault((type(event), event.topic), event)
+        if isinstance(event, RawEvent) and event.topic not in self._sizes:
+            size = event.decoded_size()
+            if size is None:
                 return False
+            self._sizes[event.topic] = size
         before = len(self.roles)
         for role, topic in self._topics.items():
-            if role not in self.roles and role not in _NOT_BUILT_FROM and not self._missing(role):
+            if role not in self.roles and base_role(role) not in _NOT_BUILT_FROM and not self._missing(role):
                 self.roles[role] = topic
-        self._incomplete = any(r not in self.roles and r not in _NOT_BUILT_FROM for r in self._topics)
+        self._incomplete = any(r not in self.roles and base_role(r) not in _NOT_BUILT_FROM for r in self._topics)
         return len(self.roles) > before
 
     def waiting_for(self) -> tuple[str, ...]:
         """Missing parts of the stream, a phrase each."""
         missing = []
-        for role in (*role_names(), *self._config.recording.beside):
-            if role in self.roles or role in _NOT_BUILT_FROM:
+        recording = self._config.recording
+        for role in (*role_names(), *recording.beside, *recording.topics.of_cameras):
+            if role in self.roles or base_role(role) in _NOT_BUILT_FROM:
                 continue
             if role in self._topics:
                 missing.append(f"{role} ({self._topics[role]}): {self._missing(role)}")
@@ -188,19 +214,21 @@ class LiveFacts:
 
     def _missing(self, role: Role) -> str:
         """Missing part without which the sensor of a role cannot be built; "" if nothing is missing."""
-        in_pixels = role == "sightings" and any(
-            e.in_pixels for e in self._seen.values() if isinstance(e, SightingsEvent)
-        )
-        if role not in _WITH_CAMERA or self.camera is not None or not (role == "image" or in_pixels):
+        camera, _, base = role.rpartition("/")
+        config = self._config.of_camera(camera)
+        own = {self._topics.get(camera_role(camera, r)) for r in CAMERA_ROLES}
+        seen = {kind: event for (kind, topic), event in self._firsts.items() if topic in own} if camera else self._seen
+        in_pixels = base == "sightings" and any(e.in_pixels for e in seen.values() if isinstance(e, SightingsEvent))
+        if base not in _WITH_CAMERA or self.camera is not None or not (base == "image" or in_pixels):
             return ""
-        if CameraInfoEvent not in self._seen and self._config.camera.file is None:
-            return "no CameraInfo yet, and no camera.file"
-        if given_pose(self._config, "optical") is not None:
+        if CameraInfoEvent not in seen and config.camera.file is None:
+            return f"no CameraInfo yet, and no {'cameras.' + camera if camera else 'camera'}.file"
+        if given_pose(config, "optical") is not None:
             return ""
-        frame = camera_frame(self._seen)
-        base = base_frame(self, self._config, self.first)
-        if frame.lstrip("/") != base.lstrip("/") and not (frame in self.frames and base in self.frames):
-            return f"no transform from {base} to {frame!r} yet, and no recording.sightings_pose"
+        frame = camera_frame(seen)
+        base_name = base_frame(self, self._config, self.first)
+        if frame.lstrip("/") != base_name.lstrip("/") and not (frame in self.frames and base_name in self.frames):
+            return f"no transform from {base_name} to {frame!r} yet, and no recording.sightings_pose"
         return ""
 
     def _add_transform(self, event: TransformEvent) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc.config import BUILT_IN_ROLES, Config, Role
+from fgloc.config import BUILT_IN_ROLES, Config, Role, base_role, base_roles
 from fgloc.errors import RecordingError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
@@ -87,7 +87,7 @@ def _received(
     at = float(received[longest] - start_ns) * 1e-9
     gap = float(intervals[longest])
     found = []
-    if topic.role is not None and topic.role not in ("camera_info", "truth", "sightings"):
+    if topic.role is not None and base_role(topic.role) not in ("camera_info", "truth", "sightings"):
         long = intervals > max(config.gate.gap_s, 3.0 * float(np.median(intervals)))
         if long.any():
             found.append(
@@ -251,9 +251,9 @@ _CHECKS: dict[Role, type[Collector]] = {"camera_info": CameraInfoChecks, "truth"
 
 def collector(role: Role) -> Collector:
     """A new collector for the topic of a role."""
-    if role in _CHECKS:
-        return _CHECKS[role]()
-    return next((stream.findings() for stream in registry.streams_of(role)), TimingOnly())
+    if base_role(role) in _CHECKS:
+        return _CHECKS[base_role(role)]()
+    return next((stream.findings() for stream in registry.streams_of(base_role(role))), TimingOnly())
 
 
 # --- The whole recording ----------------------------------------------------------------------------------------------
@@ -440,7 +440,7 @@ def _lacking(config: Config) -> dict[str, str]:
 
 def _placing(roles: Mapping[Role, str], config: Config) -> Collection[str]:
     """Roles that tell where a robot is, of sensors that the configuration has."""
-    return roles.keys() - _NO_PLACE - _lacking(config).keys()
+    return base_roles(roles) - _NO_PLACE - _lacking(config).keys()
 
 
 def _mounting(recording: Recording, bases: tuple[str, ...], frame: str, camera: bool) -> list[str]:

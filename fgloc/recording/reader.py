@@ -13,7 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.config import BUILT_IN_ROLES, RecordingConfig, Role, TopicsConfig, role_names
+from fgloc.config import (
+    BESIDE,
+    BUILT_IN_ROLES,
+    RecordingConfig,
+    Role,
+    TopicsConfig,
+    base_role,
+    camera_folder,
+    camera_role,
+    role_names,
+)
 from fgloc.errors import RecordingError
 from fgloc.recording.messages import Decoder
 from fgloc.recording.storage import RawMessage, Storage
@@ -105,6 +115,7 @@ CONVERTERS: dict[Role, dict[str, Converter]] = {
 
 def converters_of(role: Role) -> Mapping[str, Converter]:
     """Converters of any role, by message type."""
+    role = base_role(role)
     return CONVERTERS[role] if role in CONVERTERS else registry.converters(role)
 
 
@@ -153,14 +164,20 @@ def select_roles(
         config: topics given by the user; they win, and "none" switches a role off.
         beside: topics of the odometries beside the wheels, by role.
     """
-    notes: list[str] = []
-    roles, problems = _given_roles(topics, config, beside or {})
+    roles, problems, notes = _given_roles(topics, config, beside or {})
     filled = [topic for topic in topics if topic.count > 0]
-    for role in sorted(role_names(), key=_by_dependence):
+    names = (*role_names(), *config.of_cameras)
+    for role in sorted(names, key=_by_dependence):
         if config.given(role) is not None:
             continue
         candidates = [topic.name for topic in filled if _fits(role, topic) and topic.name not in roles.values()]
-        chosen, why = _choose(role, candidates, roles.get("image"))
+        camera = role.rpartition("/")[0]
+        near = roles.get(camera_role(camera, "image")) or roles.get(camera_role(camera, "sightings"))
+        if role in config.of_cameras:  # a calibration that is not beside its images may be of any camera
+            candidates = [
+                name for name in candidates if near is not None and camera_folder(name) == camera_folder(near)
+            ]
+        chosen, why = _choose(role, candidates, near)
         if chosen is not None:
             roles[role] = chosen
             if why:
@@ -185,21 +202,34 @@ def select_roles(
 
 def _given_roles(
     topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str]
-) -> tuple[dict[Role, str], list[str]]:
-    """Roles that the user gave, and what is wrong with them."""
+) -> tuple[dict[Role, str], list[str], list[str]]:
+    """Roles that the user gave, what is wrong with them, and the cameras that have nothing in the recording."""
     roles: dict[Role, str] = {}
     problems: list[str] = []
-    for role, given in (*((role, config.given(role)) for role in role_names()), *beside.items()):
+    notes: list[str] = []
+    filled = {topic.name for topic in topics if topic.count > 0}
+    seeing = [t for role, t in config.of_cameras.items() if base_role(role) != "camera_info" and t in filled]
+    own = ((role, config.given(role)) for role in (*role_names(), *config.of_cameras))
+    for role, given in (*own, *beside.items()):
         if given is None or given == "none":
             continue
-        key = "recording.odometries" if role in beside else f"recording.topics.{role}"
-        if problem := _misfit(role, given, topics, key):
+        if role in config.of_cameras and given not in filled and seeing:
+            notes.append(f"{topic_key(role)}: {given} has no messages; the run goes on without it.")
+        elif problem := _misfit(role, given, topics):
             problems.append(problem)
         elif given in roles.values():
-            problems.append(f"{key}: {given} is given for another role too; choose one of them")
+            problems.append(f"{topic_key(role)}: {given} is given for another role too; choose one of them")
         else:
             roles[role] = given
-    return roles, problems
+    return roles, problems, notes
+
+
+def topic_key(role: Role) -> str:
+    """Key of a role's topic in robot.yaml."""
+    if role.startswith(BESIDE):
+        return "recording.odometries"
+    camera, _, base = role.rpartition("/")
+    return f"cameras.{camera}.{base}" if camera else f"recording.topics.{role}"
 
 
 def _unnamed(role: Role, filled: Iterable[TopicInfo]) -> str:
@@ -242,10 +272,11 @@ def _empty(role: Role, topics: Iterable[TopicInfo]) -> str:
 
 def _by_dependence(role: Role) -> int:
     """Truth first, for its Odometry topics are not the odometry; CameraInfo after its image."""
-    return {"truth": 0, "camera_info": 2}.get(role, 1)
+    return {"truth": 0, "camera_info": 2}.get(base_role(role), 1)
 
 
 def _fits(role: Role, topic: TopicInfo) -> bool:
+    role = base_role(role)
     if topic.message_type not in converters_of(role):
         return False
     if role == "truth":
@@ -258,10 +289,11 @@ def _fits(role: Role, topic: TopicInfo) -> bool:
     return True
 
 
-def _choose(role: Role, candidates: list[str], image: str | None) -> tuple[str | None, str]:
+def _choose(role: Role, candidates: list[str], beside: str | None) -> tuple[str | None, str]:
     """The candidate to take, or None; and why, where that needs saying."""
-    if role == "camera_info" and image is not None:
-        siblings = [name for name in candidates if _camera(name) == _camera(image)]
+    role = base_role(role)
+    if role == "camera_info" and beside is not None:
+        siblings = [name for name in candidates if camera_folder(name) == camera_folder(beside)]
         if siblings:
             candidates = siblings
     if role == "truth" and (named := [name for name in candidates if _says_truth(name)]):
@@ -269,7 +301,7 @@ def _choose(role: Role, candidates: list[str], image: str | None) -> tuple[str |
         if len(named) == 1:
             return named[0], f"its name says so, unlike {', '.join(others)}" if others else ""
         return None, ""
-    if role == "image" and len(pair := candidates) == 2 and len({_camera(name) for name in pair}) == 1:
+    if role == "image" and len(pair := candidates) == 2 and len({camera_folder(name) for name in pair}) == 1:
         raw = [name for name in pair if not name.endswith("/compressed")]
         if len(raw) == 1 and f"{raw[0]}/compressed" in pair:
             return raw[0], f"not compressed, unlike {raw[0]}/compressed"
@@ -282,19 +314,19 @@ def _choose(role: Role, candidates: list[str], image: str | None) -> tuple[str |
     return None, ""
 
 
-def _misfit(role: Role, given: str, topics: Iterable[TopicInfo], key: str) -> str:
+def _misfit(role: Role, given: str, topics: Iterable[TopicInfo]) -> str:
     """Reason why a topic that is configured under a key does not fit; empty if it fits."""
     types = converters_of(role)
     found = next((topic for topic in topics if topic.name == given), None)
     fitting = [topic.name for topic in topics if topic.message_type in types and topic.count > 0]
     remedy = f"choose {' or '.join(fitting)}" if fitting else f"the recording has no topic for the {role}: use none"
     if found is None:
-        return f"{key}: {given} is not in the recording; {remedy}"
+        return f"{topic_key(role)}: {given} is not in the recording; {remedy}"
     if found.message_type not in types:
         expected = " or ".join(types)
-        return f"{key}: {given} is a {found.message_type}, expected {expected}; {remedy}"
+        return f"{topic_key(role)}: {given} is a {found.message_type}, expected {expected}; {remedy}"
     if found.count == 0:
-        return f"{key}: {given} has no messages; {remedy}"
+        return f"{topic_key(role)}: {given} has no messages; {remedy}"
     return ""
 
 
@@ -310,11 +342,6 @@ def _says_truth(topic: str) -> bool:
 def _conventional(role: Role, topic: str) -> bool:
     names = _CAMERA_INFO if role == "camera_info" else registry.usual_names(role)
     return any(topic.strip("/") == name or topic.endswith(f"/{name}") for name in names)
-
-
-def _camera(topic: str) -> str:
-    """Namespace of a camera: the folder of its image or CameraInfo."""
-    return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
 # --- Recordings -------------------------------------------------------------------------------------------------------

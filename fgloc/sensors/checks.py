@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
@@ -118,8 +118,13 @@ class FieldChecks:
         note: Callable[[str], None],
         rejections: Counter[str] | None = None,
         known_ids: Collection[int] | None = None,
+        named: Mapping[str, str] | None = None,
     ) -> None:
-        """Set up with a place for notes and counts; ``known_ids`` None: every id passes."""
+        """Set up with a place for notes and counts; ``known_ids`` None: every id passes.
+
+        ``named`` has the camera of each topic where there are several.
+        """
+        self._named = named or {}
         self.config = config
         self.rejections: Counter[str] = Counter() if rejections is None else rejections
         self._note = note
@@ -157,7 +162,8 @@ class FieldChecks:
             if 0 <= number <= MAX_LANDMARK_ID:
                 verdict = "unknown_id" if self._is_unknown(number) else judge(event.topic, sighting)
             if isinstance(verdict, str):
-                self.rejections[f"sightings.{verdict}"] += 1
+                camera = self._named.get(event.topic, "")
+                self.rejections[f"{camera}{'/' if camera else ''}sightings.{verdict}"] += 1
                 changed = True
             else:
                 kept.append(verdict)

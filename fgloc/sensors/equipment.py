@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,10 @@ from fgloc.types import (
     LandmarkMap,
     SightingsEvent,
     Step,
+    camera_of,
 )
+
+_Measurers = dict[type, Callable[[Any], Iterator[LandmarkSighting]]]
 
 
 class LandmarkSensor:
@@ -39,20 +42,30 @@ class LandmarkSensor:
     """
 
     def __init__(
-        self, config: Config, landmark_map: LandmarkMap | None, camera: Camera | None, T_base_sensor: FloatArray | None
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        camera: Camera | Sequence[Camera] | None,
+        T_base_sensor: FloatArray | None,
     ) -> None:
         """Prepare the conversion.
 
         Args:
             config: all settings.
             landmark_map: the known map; None if landmarks are estimated.
-            camera: of corners; None if there is none.
+            camera: of corners, or several, each for the corners of its topics; None if there is none.
             T_base_sensor: ``(4, 4)`` takes coordinates as the sensor reports them (optical axes included) to the base;
                 None: they are in the base frame.
         """
         place = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
-        self._context = SightingContext(config, landmark_map, camera, place)
-        self._measure: dict[type, Callable[[Any], Iterator[LandmarkSighting]]] = registry.measurers(self._context)
+        self.cameras = () if camera is None else (camera,) if isinstance(camera, Camera) else tuple(camera)
+        one = self.cameras[0] if len(self.cameras) == 1 else None
+        self._context = SightingContext(config, landmark_map, one, place)
+        self._measure: _Measurers = registry.measurers(self._context)
+        self._of_camera: dict[str, _Measurers] = {}  # by name, of several
+        if one is None:
+            contexts = {camera.name: replace(self._context, camera=camera) for camera in self.cameras}
+            self._of_camera = {name: registry.measurers(context) for name, context in contexts.items()}
 
     @property
     def rejections(self) -> Counter[str]:
@@ -62,7 +75,17 @@ class LandmarkSensor:
     @property
     def sees_corners(self) -> bool:
         """Whether there is a camera, so that sightings may be corners in images."""
-        return self._context.camera is not None
+        return bool(self.cameras)
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Names of the cameras; "" of one that is alone."""
+        return tuple(camera.name for camera in self.cameras)
+
+    def camera_name(self, event: SightingsEvent) -> str:
+        """Name of the camera that a message is of; "" if there are not several."""
+        camera = camera_of(self.cameras, event.topic)
+        return "" if camera is None else camera.name
 
     def measure(self, event: SightingsEvent) -> tuple[LandmarkSighting, ...]:
         """Measurements of the landmarks in one message.
@@ -71,7 +94,8 @@ class LandmarkSensor:
             CameraError: marker corners, but no camera.
             ConfigError: marker corners without map, and no marker size.
         """
-        return tuple(self._measure[type(event)](event))
+        measurers = self._of_camera.get(self.camera_name(event), self._measure)
+        return tuple(measurers[type(event)](event))
 
     def known(self, measurements: Iterable[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
         """Measurements but for those of landmarks that the map does not have, which are counted as rejected."""
@@ -139,19 +163,20 @@ class MotionCompensation:
         self._wheels, self._gyro, self._attitude = motion.wheels, motion.gyro, motion.attitude
         self._sensor_of = {stream.event: sensor for sensor in poses.registered for stream in sensor.streams}
 
-    def measure(self, step: Step, offset_s: float) -> list[LandmarkMeasurement]:
+    def measure(self, step: Step, late_s: float | Callable[[str], float]) -> list[LandmarkMeasurement]:
         """Measurements of a step, moved to its end.
 
         Args:
             step: the newest one.
-            offset_s: how late stamps of sightings are, as far as is known; what is left of it, the residual sees with
-                the speed at the exposure.
+            late_s: how late stamps of sightings are, as far as is known, or a function that gives it by the name of
+                the camera; what is left of it, the residual sees with the speed at the exposure.
         """
         measured: list[LandmarkMeasurement] = []
         for event in step.sightings:
             found = self._landmarks.measure(event)
             if not found:
                 continue
+            offset_s = late_s(self._landmarks.camera_name(event)) if callable(late_s) else late_s
             exposure_ns = event.stamp_ns - round(offset_s * 1e9)
             twist = self.twist(step, exposure_ns)
             late = [m.exposed(twist, offset_s, self._jitter_s) for m in found]

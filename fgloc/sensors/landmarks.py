@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, camera_role
 from fgloc.sensors.measurements import FrameMeasurement, PointMeasurement
 from fgloc.types import Camera, FloatArray, Landmark, LandmarkMap, Sighting
 
@@ -52,9 +52,9 @@ class SightingContext:
         for sighting in sightings:
             number = sighting.landmark_id
             if self.landmark_map is not None and number not in self.landmark_map:
-                self.rejections["sightings.unknown_id"] += 1
+                self.reject("unknown_id")
             elif times[number] > 1:
-                self.rejections["sightings.duplicate_id"] += 1
+                self.reject("duplicate_id")
             else:
                 usable.append(sighting)
         return usable
@@ -63,9 +63,10 @@ class SightingContext:
         """Landmark of the known map by its id; None without a map."""
         return None if self.landmark_map is None else self.landmark_map.landmarks[landmark_id]
 
-    def reject(self, reason: str) -> None:
-        """Count a sighting that is not used."""
-        self.rejections[f"sightings.{reason}"] += 1
+    def reject(self, reason: str, count: int = 1) -> None:
+        """Count sightings that are not used, by the camera that they are of where there are several."""
+        name = "" if self.camera is None else self.camera.name
+        self.rejections[f"{camera_role(name, 'sightings')}.{reason}"] += count
 
     def range_bearing_cov(self, distance: float) -> FloatArray:
         """Covariance ``(2, 2)`` of range [m] and bearing [rad] at a distance [m], as configured."""

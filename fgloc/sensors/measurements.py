@@ -18,6 +18,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 from fgloc import se2
+from fgloc.config import camera_role
 from fgloc.sensors.cameras import marker_pose_candidates, planar_base_candidates
 from fgloc.types import Camera, FloatArray, Landmark
 
@@ -210,8 +211,6 @@ class PixelMeasurement:
 
     model: ClassVar[Model] = Model.CORNERS
     cov: ClassVar[None] = None
-    row_kind: ClassVar[str] = "corners"
-    counted_as: ClassVar[str] = "sightings"
     of_landmark: ClassVar[bool] = True
     is_point: ClassVar[bool] = False
     gives_pose: ClassVar[bool] = True
@@ -236,6 +235,16 @@ class PixelMeasurement:
     motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
     cauchy_k: float = 3.0  # Cauchy constant, in units of sigma
     tilting: FloatArray = field(default_factory=lambda: _LEVEL)  # (2,) rad/s: roll and pitch rate of the base
+
+    @property
+    def row_kind(self) -> str:
+        """Kind of its row in ``steps.csv``, with the camera's name if it is one of several."""
+        return camera_role(self.camera.name, "corners")
+
+    @property
+    def counted_as(self) -> str:
+        """Name under which it is counted if it is rejected."""
+        return camera_role(self.camera.name, "sightings")
 
     @property
     def row_id(self) -> int:

@@ -30,7 +30,7 @@ SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" 
 def found(names: dict[str, tuple[float, float, float]], **parts) -> InstallationFound:
     """By name: mean, sigma, sigma of the prior."""
     mean, sigma, prior = (np.array(column) for column in zip(*names.values(), strict=True))
-    given = {"camera": None, "seen_by": "sightings", "wheels": "odometry"} | parts
+    given = {"cameras": (), "seen_by": "sightings", "wheels": "odometry"} | parts
     return InstallationFound(tuple(names), mean, np.diag(sigma**2), np.diag(prior**2), **given)
 
 
@@ -146,7 +146,7 @@ def _distortion(name: str) -> Setting:
 
 
 def _fields(state: InstallationFound) -> dict[str, object]:
-    names = ("names", "mean", "cov", "prior_cov", "camera", "seen_by", "wheels")
+    names = ("names", "mean", "cov", "prior_cov", "cameras", "seen_by", "wheels")
     return {name: getattr(state, name) for name in names}
 
 

@@ -46,7 +46,7 @@ class Looked:
             self.excerpt = read_excerpt(recording, self.config, parts.detector)
             self.up = base_up(recording, self.config)
         self.excerpt.pictures = self.excerpt.pictures[:stretches]
-        self.landmarks, self.camera = parts.landmark_map, parts.camera
+        self.landmarks, (self.camera,) = parts.landmark_map, parts.cameras
 
     def check(self, config=None, landmarks=None, camera=None, excerpt=None):
         """The check with some of the set-up replaced."""

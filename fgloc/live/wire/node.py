@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.config import Config, RecordingConfig, Role
+from fgloc.config import Config, RecordingConfig, Role, base_role
 from fgloc.errors import FglocError, WireError
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LiveStatus
@@ -20,7 +20,7 @@ from fgloc.live.process import EstimationProcess
 from fgloc.live.run import MOTION
 from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, odom_in_map
 from fgloc.live.wire.participant import OWN, Participant, Publication, Sample, WireClock
-from fgloc.recording.reader import TF_TYPES, TopicInfo, events_of, select_roles
+from fgloc.recording.reader import TF_TYPES, TopicInfo, events_of, select_roles, topic_key
 from fgloc.recording.standard_messages import MAP_FRAME
 from fgloc.types import Estimate, Event, LandmarkMap, Severity
 
@@ -106,14 +106,15 @@ class Intake:
         lacking = []
         if not set(MOTION) & roles.keys():
             lacking.append("odometry, joint states, commands or an IMU")
-        wanted = [role for role in LOOK if getattr(self._config.topics, role) != "none"]
+        every = (*MOTION, *LOOK, "camera_info", *self._config.topics.of_cameras)
+        wanted = [role for role in every if base_role(role) in LOOK and self._config.topics.given(role) != "none"]
         if wanted and not set(wanted) & roles.keys():
             lacking.append("images or marker sightings")
         names = {p.topic for p in self._found}
-        for role in (*MOTION, *LOOK, "camera_info"):
-            given = getattr(self._config.topics, role)
+        for role in every:
+            given = self._config.topics.given(role)
             if given not in (None, "none") and given not in names:
-                lacking.append(f"{given} (recording.topics.{role})")
+                lacking.append(f"{given} ({topic_key(role)})")
         there = ", ".join(f"{p.topic} ({p.message_type})" for p in self._found) or "none"
         return f"Waiting for {' and '.join(lacking)}; topics there: {there}." if lacking else ""
 

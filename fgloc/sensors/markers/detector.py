@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from fgloc.config import Config, MarkersConfig
+from fgloc.config import Config, MarkersConfig, Role
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import nested, read_text
@@ -55,7 +55,16 @@ def use_one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def detect_stream(events: Iterable[Event], detector: Detector, rejections: Counter[str]) -> Iterator[Event]:
+def _of_one_camera(topic: str) -> Role:
+    return "image"
+
+
+def detect_stream(
+    events: Iterable[Event],
+    detector: Detector,
+    rejections: Counter[str],
+    image_role: Callable[[str], Role] = _of_one_camera,
+) -> Iterator[Event]:
     """All events in their order, with a sightings event in the place of each image.
 
     Detection runs in one thread of its own, at most a few images ahead of the consumer; OpenCV releases Python's lock
@@ -64,36 +73,40 @@ def detect_stream(events: Iterable[Event], detector: Detector, rejections: Count
     Args:
         events: any events; an image that cannot be decoded is left out.
         detector: not to be used elsewhere at the same time.
-        rejections: counts images left out, as "image." and the reason.
+        rejections: counts images left out, by role and reason.
+        image_role: gives the role of a topic of images.
     """
     use_one_thread()
-    waiting: deque[Event | Future[SightingsEvent]] = deque()
+    waiting: deque[Event | tuple[str, Future[SightingsEvent]]] = deque()
     images = 0
     worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="marker-detection")
     try:
         for event in events:
             if isinstance(event, RawEvent):
-                waiting.append(worker.submit(detector.detect, event))
+                waiting.append((event.topic, worker.submit(detector.detect, event)))
                 images += 1
             else:
                 waiting.append(event)
-            while waiting and (images > _LOOKAHEAD or not isinstance(waiting[0], Future) or waiting[0].done()):
-                images -= isinstance(waiting[0], Future)
-                yield from _resolved(waiting.popleft(), rejections)
+            while waiting and (images > _LOOKAHEAD or isinstance(waiting[0], Event) or waiting[0][1].done()):
+                images -= not isinstance(waiting[0], Event)
+                yield from _resolved(waiting.popleft(), rejections, image_role)
         while waiting:
-            yield from _resolved(waiting.popleft(), rejections)
+            yield from _resolved(waiting.popleft(), rejections, image_role)
     finally:
         worker.shutdown(wait=True, cancel_futures=True)
 
 
-def _resolved(item: Event | Future[SightingsEvent], rejections: Counter[str]) -> Iterator[Event]:
-    if not isinstance(item, Future):
+def _resolved(
+    item: Event | tuple[str, Future[SightingsEvent]], rejections: Counter[str], image_role: Callable[[str], Role]
+) -> Iterator[Event]:
+    if isinstance(item, Event):
         yield item
         return
+    topic, found = item
     try:
-        yield item.result()
+        yield found.result()
     except ImageError as error:
-        rejections[f"image.{error.reason}"] += 1
+        rejections[f"{image_role(topic)}.{error.reason}"] += 1
 
 
 _FILE_SUFFIXES = {".yml", ".yaml", ".json", ".xml"}
@@ -224,7 +237,7 @@ class MarkerDetector:
 
     def following(self) -> Detector:
         """A detector that follows the markers from image to image, which have to come in their order."""
-        return TrackingDetector(self)
+        return TrackingDetectors(self)
 
     def coarse(self) -> CoarseSearch:
         """A faster search, for images between those that this one searches."""
@@ -424,6 +437,21 @@ class TrackingDetector:
             read = self._detector.find_within(image, part)
             found += [(i, c) for i, c in read if not any(i == j and _near(c, d) for j, d in found)]
         return None if known and not found else in_order(found)
+
+
+class TrackingDetectors:
+    """Finds the markers of the images of any number of cameras, each followed by itself."""
+
+    def __init__(self, detector: MarkerDetector) -> None:
+        """Take the detector that all of them share."""
+        self._detector = detector
+        self._of_topic: dict[str, TrackingDetector] = {}
+
+    def detect(self, event: ImageEvent) -> CornersEvent:
+        """The markers of one image; raises as `TrackingDetector.detect` does."""
+        if event.topic not in self._of_topic:
+            self._of_topic[event.topic] = TrackingDetector(self._detector)
+        return self._of_topic[event.topic].detect(event)
 
 
 def _compare(known: Found, found: Found) -> tuple[list[FloatArray], list[FloatArray]]:

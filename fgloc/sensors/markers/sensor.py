@@ -288,7 +288,7 @@ class CornerMeasurer:
         usable.sort(key=lambda s: -_area(s.corners_px))
         most = self._context.config.markers.max_sightings
         if len(usable) > most:
-            self._context.rejections["sightings.beyond_max"] += len(usable) - most
+            self._context.reject("beyond_max", len(usable) - most)
         for seen in usable[:most]:
             landmark = self._context.landmark(seen.landmark_id)
             if landmark is None or landmark.size_m == 0.0:
