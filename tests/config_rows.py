@@ -23,6 +23,10 @@ def sections(model=PAGES["configuration.md"], path=""):
         if (kind := _section(field)) is not None:
             yield f"{path}{name}", kind
             yield from sections(kind, f"{path}{name}.")
+        if typing.get_origin(field.annotation) is dict:
+            kind = typing.get_args(field.annotation)[1]
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                yield f"{path}{name}.NAME", kind
         for kind in _kinds(field):
             yield f"{path}{name}: {kind.model_fields['kind'].default}", kind
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from fgloc.config import Config, Role, config_of_file
+from fgloc.config import CAMERA_ROLES, Config, Role, camera_role, config_of, config_of_file
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.landmark_fits import Noise
@@ -18,12 +18,12 @@ from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.info import RecordingInfo, inspect_recording
-from fgloc.recording.reader import Recording
+from fgloc.recording.reader import Recording, is_derived
 from fgloc.recording.storage import find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
 from fgloc.sensors.base import FirstLook, FirstSection
-from fgloc.types import Event, Finding, ordered
+from fgloc.types import Event, Finding, SightingsEvent, ordered
 
 _UNCALIBRATED = {
     "range_scale_sigma": 0.03,
@@ -35,6 +35,13 @@ _WHEELS: tuple[str, ...] = (
     "  # Nobody has calibrated this odometry: radii and track may be off by more than those of measured wheels.",
     "  scale_sigma: 0.02",
     "  turn_scale_sigma: 0.05",
+)
+_IMAGES = frozenset({"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
+_CORNERS = frozenset(
+    kind
+    for stream in registry.streams_of("sightings")
+    if issubclass(stream.event, SightingsEvent) and stream.event.in_pixels
+    for kind in stream.converters
 )
 _CORRELATED_S = 1.0  # views from about one place err alike, for longer than the scatter over seconds shows
 _COMMANDED = (
@@ -98,6 +105,7 @@ def first_settings(bag: Path) -> RobotFile:
         f"# Robot of {bag}. What is commented out has to be filled in or is the default.",
         "# All keys: docs/configuration.md. `fgloc info BAG --config robot.yaml` checks it.",
         *_recording(seen, missing),
+        *_cameras(seen),
     ]
     for section in seen.sections:
         lines += ["", *section.lines] if section.lines else []
@@ -211,7 +219,7 @@ def _places(lines: Sequence[str]) -> list[str]:
 
 
 def _look(bag: Path) -> _Seen:
-    config = Config()
+    config = _with_cameras(bag, Config())
     wanted = registry.first_settings()
     events: dict[type[Event], list[Event]] = {kind: [] for of in wanted for kind in of.events}
 
@@ -227,10 +235,51 @@ def _look(bag: Path) -> _Seen:
         return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted))
 
 
+def _with_cameras(bag: Path, config: Config) -> Config:
+    """The configuration with a section for each camera, where several topics have images, or corners of markers."""
+    with Recording(bag, config.recording) as recording:
+        if {"image", "sightings"} & recording.roles.keys():
+            return config
+        topics = [t for t in recording.topics if t.count]
+    for role, kinds in (("image", _IMAGES), ("sightings", _CORNERS)):
+        there = [t.name for t in topics if t.message_type in kinds and not is_derived(t.name)]
+        plain = [name for name in there if name.removesuffix("/compressed") not in there or "/compressed" not in name]
+        if len(plain) > 1:
+            cameras = {name: {role: topic} for name, topic in zip(_names(plain), plain, strict=True)}
+            return config_of({"cameras": cameras})
+    return config
+
+
+def _names(topics: Sequence[str]) -> list[str]:
+    """Names of cameras: the words by which their topics differ."""
+    words = [re.findall(r"[A-Za-z0-9]+", topic) for topic in topics]
+    common = set(words[0]).intersection(*words[1:])
+    found = ["_".join(w for w in own if w not in common) or "camera" for own in words]
+    found = [name if name[0].isalpha() else f"camera_{name}" for name in found]
+    return [name if found.count(name) == 1 else f"{name}_{i}" for i, name in enumerate(found)]
+
+
+def _cameras(seen: _Seen) -> Iterator[str]:
+    """Section of several cameras."""
+    names = dict.fromkeys(role.partition("/")[0] for role in seen.info.roles if "/" in role)
+    if not names:
+        return
+    yield ""
+    yield "cameras:  # docs/cameras.md: each has a place, a clock and a calibration of its own"
+    for name in names:
+        yield f"  {name}:"
+        for role in CAMERA_ROLES:
+            if topic := seen.info.roles.get(camera_role(name, role)):
+                yield f"    {role}: {topic}"
+
+
 def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
+    several = any("/" in role for role in seen.info.roles)
     yield "recording:"
     yield "  topics:  # found by message type and name; none: not used although it is there"
     for role, meaning in _MEANINGS.items():
+        if several and role in CAMERA_ROLES:
+            continue
         if role in seen.info.roles:
             yield f"    {role}: {seen.info.roles[role]}  # {meaning}"
         else:

@@ -224,6 +224,11 @@ def _given_roles(
     return roles, problems, notes
 
 
+def is_derived(topic: str) -> bool:
+    """Whether the name of a topic of images says that they are of no camera: depth, a mask, an overlay."""
+    return bool(_NOT_IMAGE.search(topic))
+
+
 def topic_key(role: Role) -> str:
     """Key of a role's topic in robot.yaml."""
     if role.startswith(BESIDE):
@@ -285,7 +290,7 @@ def _fits(role: Role, topic: TopicInfo) -> bool:
     if role == "odometry":
         return not _says_truth(topic.name)
     if role in ("image", "camera_info"):
-        return not _NOT_IMAGE.search(topic.name)
+        return not is_derived(topic.name)
     return True
 
 

@@ -160,7 +160,8 @@ class MarkersInput(EventInput):
 
 def _first_section(look: FirstLook) -> FirstSection:
     """Dictionary and size, as far as the images show them."""
-    if "image" not in look.roles:
+    roles = {role.rpartition("/")[2] for role in look.roles}
+    if "image" not in roles:
         return FirstSection()
 
     lines, missing = ["markers:"], []
@@ -178,7 +179,7 @@ def _first_section(look: FirstLook) -> FirstSection:
             "the size of the markers: measure the side of the black square and give it (markers.default_size_m)"
         )
     lines.append("  sigma_px: 0.1  # of a corner: 0.1 for a sharp camera, 0.3 for one that shakes")
-    if "camera_info" not in look.roles:
+    if "camera_info" not in roles:
         lines += [
             "",
             "# The recording has no CameraInfo:",
