@@ -1,6 +1,7 @@
 # From a fresh clone each target does everything: it makes .venv, installs what it needs, and runs.
 # Another interpreter: `make demo PYTHON=python3.12`. No CUDA build of torch: see CONTRIBUTING.md.
 PYTHON ?= python3
+OTHER ?= python3.13
 JOBS ?= 2
 BENCHMARKS ?= steps real sim identification adaptive ablation gross
 QUICK ?= $(addprefix tests/,test_layout.py test_fault_catalogue.py docs files intake view graph/test_graph.py graph/test_observation.py)
@@ -12,14 +13,16 @@ BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo follow quick test test-all check equal format bench docs docs-test dist clean
+.PHONY: help demo follow quick other test test-all coverage check equal format bench docs docs-test dist clean
 
 help:
 	@echo "make demo      smooth the bundled recording, batch and online, into demo-out/"
 	@echo "make follow    a simulated robot drives itself along waypoints: a picture and a table, in follow-out/"
 	@echo "make quick     those tests that take less than a minute together"
+	@echo "make other     the same with another interpreter: make other OTHER=python3.13"
 	@echo "make test      all but the slow tests: some minutes"
 	@echo "make test-all  all tests"
+	@echo "make coverage  the tests of \`make test\`, and which lines they execute, in htmlcov/"
 	@echo "make check     ruff format, ruff, mypy"
 	@echo "make equal     whether short runs of all kinds give the committed results, bit by bit"
 	@echo "make dist      sdist and wheel in dist/, checked in a fresh environment outside the repository"
@@ -37,11 +40,28 @@ follow: .venv/.sim
 quick: .venv/.dev
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" $(QUICK)
 
+# In an environment of its own and without torch, of which another interpreter needs another build.
+other: .venv-other/.made
+	.venv-other/bin/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" $(filter-out tests/docs,$(QUICK))
+
+.venv-other/.made: pyproject.toml constraints.txt
+	$(OTHER) -m venv .venv-other
+	.venv-other/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt \
+		-e '.[sim,sweep,live,view]' evo hypothesis pytest-xdist
+	@touch $@
+
 test: .venv/.dev
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
 
 test-all: .venv/.docs
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+coverage: .venv/.dev
+	rm -rf htmlcov .coverage .coverage.*
+	$(BIN)/python -m coverage run -m pytest -n $(JOBS) --dist worksteal -m "not slow" $(COVERED)
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage html --quiet
+	$(BIN)/python -m coverage report
 
 check: .venv/.dev
 	$(BIN)/ruff format --check .
@@ -75,7 +95,7 @@ dist: .venv/.dev
 	cd $$place; venv/bin/fgloc --version; venv/bin/fgloc demo
 
 clean:
-	rm -rf .venv build dist site demo-out follow-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
+	rm -rf .venv .venv-other htmlcov .coverage .coverage.* build dist site demo-out follow-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' || \

@@ -9,7 +9,6 @@ beacons (``robot_*``, online).
   the rest. ``off.together.*`` is with all of these off at once, or with those that ``--together`` names.
 - ``off.*``: mean over the seeds with the mechanism off over that with it on; spreads are of the single ratios. They are
   of the failures that were run for the row before, or of all of them (hours) with ``--rows off.``.
-- ``mechanisms.constants``, ``.lines``: as `benchmarks.mechanisms_count` defines them; ``--list`` prints the constants.
 - ``rules66.*``: ATE of the textbook's pipeline with three rules over that of fgloc without learned motion, online.
 - ``*.over_before``: ATE over that of an earlier file of `benchmarks.installed`, given by ``--before``.
 - ``motion.*``: slips on the floors of ``none``, ``slip`` and ``mu01``; recall is of slips of 3 cm and more.
@@ -33,7 +32,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import mechanisms_count
 from benchmarks.adaptive_recordings import Split
 from benchmarks.common import Row, main, not_run
 from benchmarks.installed_recordings import SEEDS, Take, prepare
@@ -94,20 +92,14 @@ def measure(quick: bool, options: Options) -> Iterator[Row]:
     if options.together:
         yield from _together(chosen, [BY_NAME[name] for name in options.together], {}, options)
         return
-    yield from (row for row in counted() if options.wants(row.id))
+    if options.wants("mechanisms.kept"):
+        yield Row("mechanisms.kept", len(MECHANISMS))
     try:
         yield from _of_runs(chosen, options)
         cases = [case for case in RULES_CASES if case in chosen.cases and options.wants(_rules_id(case))]
         yield from rules66(chosen, cases, options.jobs)
     except RenderError as error:
         yield from not_run([w.id for w in wanted(chosen) if options.wants(w.id)], str(error))
-
-
-def counted() -> Iterator[Row]:
-    """Rows of the numbers that are counted in the code."""
-    yield Row("mechanisms.kept", len(MECHANISMS))
-    yield Row("mechanisms.constants", sum(len(found) for found in mechanisms_count.constants().values()))
-    yield Row("mechanisms.lines", sum(mechanisms_count.lines().values()))
 
 
 def _of_runs(chosen: Scope, options: Options) -> Iterator[Row]:
@@ -188,8 +180,8 @@ def _rules_id(case: str) -> str:
     return f"rules66.{case}.over_fgloc"
 
 
-def parsed(argv: Sequence[str] | None = None) -> tuple[Options, bool, list[str]]:
-    """Options, whether to list the constants, and what is left for `benchmarks.common`."""
+def parsed(argv: Sequence[str] | None = None) -> tuple[Options, list[str]]:
+    """Options, and what is left for `benchmarks.common`."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--rows", default="", help="comma-separated beginnings of ids")
@@ -197,20 +189,16 @@ def parsed(argv: Sequence[str] | None = None) -> tuple[Options, bool, list[str]]
     parser.add_argument("--seeds", type=int, help="so many of the split's seeds")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--together", default="", help="names of mechanisms: only the rows with all of them off")
-    parser.add_argument("--list", action="store_true", help="print the hand-set constants and end")
     known, rest = parser.parse_known_args(argv)
     prefixes = tuple(known.rows.split(","))
     at_once = tuple(name for name in known.together.split(",") if name)
     if unknown := sorted(set(at_once) - set(BY_NAME)):
         parser.error(f"no mechanism {', '.join(unknown)}; there are {', '.join(BY_NAME)}")
-    return Options(known.split, prefixes, known.before, known.seeds, at_once, known.jobs), known.list, rest
+    return Options(known.split, prefixes, known.before, known.seeds, at_once, known.jobs), rest
 
 
 if __name__ == "__main__":
-    options, listing, rest = parsed()
-    if listing:
-        print(mechanisms_count.listing(mechanisms_count.constants()))
-    else:
-        main(lambda quick: measure(quick, options), __doc__ or "", rest)
+    options, rest = parsed()
+    main(lambda quick: measure(quick, options), __doc__ or "", rest)
 
-__all__ = ["Options", "Outcomes", "counted", "measure", "parsed", "scope"]
+__all__ = ["Options", "Outcomes", "measure", "parsed", "scope"]

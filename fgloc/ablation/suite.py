@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 from fgloc.ablation.failures import AnyFailure
 from fgloc.config import Config, Section, config_of, config_type, load_config, robot_file
 from fgloc.errors import ConfigError
-from fgloc.files.settings import Settings, joined, refuse_misplaced, sentences
+from fgloc.files.settings import Settings, joined, merged, refuse_misplaced, sentences
 from fgloc.recording.storage import find_beside
 from fgloc.replay import RunMode
 
@@ -194,7 +194,7 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
 
 
 def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path) -> Config:
-    content = _merged(_merged(base.model_dump(), joined(entry.settings)), joined(variant.config))
+    content = merged(merged(base.model_dump(), joined(entry.settings)), joined(variant.config))
     for section, key in (("camera", "file"), ("motion", "model")):
         part = content[section]
         if isinstance(part, dict) and isinstance(part.get(key), str):  # of the suite; the base's are paths already
@@ -209,11 +209,3 @@ def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path)
         raise ConfigError(
             "\n  ".join([f"variant '{variant.name}' of recording '{entry.name}': wrong configuration", *lines])
         ) from error
-
-
-def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    out = dict(base)
-    for key, value in change.items():
-        old = out.get(key)
-        out[key] = _merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-    return out

@@ -109,15 +109,15 @@ def joined(content: Any) -> Any:
     """Content of a settings file with the values under ``expert`` in the sections that they belong to."""
     if not isinstance(content, Mapping):
         return content
-    return _merged({key: value for key, value in content.items() if key != EXPERT}, content.get(EXPERT) or {})
+    return merged({key: value for key, value in content.items() if key != EXPERT}, content.get(EXPERT) or {})
 
 
-def _merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+def merged(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of ``base`` with those of ``change`` in their places, also within sections."""
     out = dict(base)
     for key, value in change.items():
-        if isinstance(value, Mapping):
-            value = _merged(out.get(key) or {}, value)
-        out[key] = value
+        old = out.get(key)
+        out[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return out
 
 
@@ -182,7 +182,7 @@ def refuse_misplaced(content: Any, model: type[Section], where: Callable[[Sequen
     moved: dict[str, Any] = {}
     for _, _, value in wrong:
         if value is not None:
-            moved = _merged(moved, value)
+            moved = merged(moved, value)
     lines = [f"{where(loc)}{sentence}" for loc, sentence, _ in wrong]
     if len(lines) > 1:
         lines = [f"{len(lines)} settings are elsewhere now, or none any more", *(f"  {line}" for line in lines)]

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from exact import exact
 from robot_world import Chain, World, room
 
+import fgloc
 from benchmarks import mechanisms
 from benchmarks.common import Row
 from benchmarks.installed_scores import Errors
 from benchmarks.mechanisms_cells import Cell, Outcome
-from benchmarks.mechanisms_count import constants, in_sections, in_source, lines
 from benchmarks.mechanisms_effect import changes, outside, ratio
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
 from benchmarks.mechanisms_report import report, without_effect
@@ -26,23 +27,7 @@ from fgloc.estimation import sightings as association
 from fgloc.estimation.sightings import Association
 from fgloc.types import LandmarkMap
 
-SOURCE = '''
-"""Says 7."""
-_FAR, _NEAR = 3.5, 1.0
-_TABLE = {1: 0.8, 2: [0.1, -4.0]}
-def f(x, k=9, n=-1):
-    y = np.zeros((3, 3))
-    return x[:3] * 6 + x[0] ** 2 - 0.5 * 1e-9 * y * True
-'''
-SECTIONS = """
-class GateConfig(Section):
-    a: float = Field(5.0, gt=3, description="9")
-    b: tuple[float, float] = (0.05, 1.0)
-    c: bool = True
-    d: Other = Other(8)
-class OtherConfig(Section):
-    e: float = 7.0
-"""
+PACKAGE = Path(fgloc.__file__).parent
 
 
 def moved_world(seconds=12.0):
@@ -85,10 +70,7 @@ def test_each_switch_replaces_what_is_there_and_puts_it_back(mechanism):
 
 def test_names_are_unique_and_modules_exist():
     assert len(BY_NAME) == len(MECHANISMS)
-    known = {
-        path.relative_to(mechanisms.mechanisms_count.PACKAGE).as_posix()
-        for path in mechanisms.mechanisms_count.PACKAGE.rglob("*.py")
-    }
+    known = {path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py")}
     for mechanism in MECHANISMS:
         assert set(mechanism.modules) <= known, mechanism.name
         assert mechanism.purpose.endswith(".")
@@ -165,14 +147,6 @@ def test_several_at_once_are_all_off_and_have_one_file():
     name = file_name(Cell(3, "none", both.name))
     assert "together" in name
     assert name != file_name(Cell(3, "none", "gate+misread_ids"))
-
-
-def test_constants_are_counted_by_the_definition():
-    found = [(x.name, x.value) for x in in_source(SOURCE)]
-    assert found == [("(_FAR, _NEAR)", 3.5), ("_TABLE", 0.8), ("_TABLE", 0.1), ("_TABLE", -4.0), ("", 9.0), ("", 6.0)]
-    assert [(x.name, x.value) for x in in_sections(SECTIONS)] == [("GateConfig.a", 5.0), ("GateConfig.b", 0.05)]
-    assert len(lines()) + 1 == len(constants())
-    assert {row.id for row in mechanisms.counted()} == {f"mechanisms.{x}" for x in ("kept", "constants", "lines")}
 
 
 def test_a_change_counts_where_it_is_large_enough():
@@ -252,8 +226,8 @@ def test_a_mechanism_is_taken_away_where_it_is_for_something_and_elsewhere_only_
 
 
 def test_the_command_line_chooses_split_seeds_and_rows():
-    options, listing, rest = mechanisms.parsed(["--split", "validation", "--rows", "off.gate.,motion.", "--quick"])
-    assert (options.split, listing, rest) == ("validation", False, ["--quick"])
+    options, rest = mechanisms.parsed(["--split", "validation", "--rows", "off.gate.,motion.", "--quick"])
+    assert (options.split, rest) == ("validation", ["--quick"])
     assert options.wants("motion.delay_s")
     assert not options.wants("off.gate_keeper.none")
     assert mechanisms.scope(False, options).seeds == (41, 42, 43)
