@@ -51,11 +51,11 @@ def by_hand(found: Conventions, path: Path) -> Path:
         return path  # no robot is in hands for most of a drive: the gyro's unit or axes are wrong
     found.handling = in_hand
     for code, what, spans in (
-        ("held", "The robot was held, or its wheels spun: they turn more than the gyro from ", in_hand.held),
-        ("lifted", "The robot was lifted or turned by hand, by gyro and accelerometer, from ", in_hand.lifted),
+        ("motion.held", "The robot was held, or its wheels spun: they turn more than the gyro from ", in_hand.held),
+        ("motion.lifted", "The robot was lifted or turned by hand, by gyro and accelerometer, from ", in_hand.lifted),
     ):
         if spans:
-            found.add(f"motion.{code}", f"{what}{_text(spans)}", None, Figure(spans[0][0], 1.0), Severity.WARNING)
+            found.add(code, f"{what}{_text(spans)}", None, Figure(spans[0][0], 1.0), Severity.WARNING)
     size = in_hand.gravity
     if size is not None and _GRAVITY_OFF < abs(size / _GRAVITY_SIZE - 1.0) < _OTHER_UNIT:
         text = (
