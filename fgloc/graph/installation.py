@@ -209,7 +209,7 @@ def _block(name: str) -> str:
 
 _UNSEEN = 1e-6  # share of its variance by which measurements make a constant surer that they say nothing of
 _HELD = 1e-5  # sigma of a parameter that is taken as exact although its block is a state
-MOST_LANDMARKS = 60  # states of landmarks; a larger map is taken as exact but for noise, to bound the work of a step
+MOST_LANDMARKS = 60  # that are states, to bound the work of a step; of a larger map one fewer for each further one
 
 
 def installation_of(
@@ -232,7 +232,8 @@ def installation_of(
         landmark_map: the known map; None: landmarks are variables of their own, only motion has parameters here.
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
-        most: landmarks of a map that are states; a larger map is taken as exact.
+        most: landmarks of a map that are states. Of a larger map one fewer for each landmark more, and from twice as
+            many on none: the others are taken as exact. The worst known ones are states.
         has_model: whether there is a learned motion.
         sensed: parameters of registered sensors.
         cameras: names of the cameras that see corners.
@@ -261,13 +262,20 @@ def installation_of(
         sigmas |= {f"sightings.{name}": v for name, v in zip(SENSOR, sensor, strict=True)}
         if rb.position_sigma_m > 0.0:
             sigmas |= {f"sightings.{name}": rb.position_sigma_m for name in PLACE}
-    if len(landmark_map) <= most:
-        for i, landmark in sorted(landmark_map.landmarks.items()):
-            sigmas |= _landmark_sigmas(i, landmark, config, corners)
+    by_id = dict(sorted(landmark_map.landmarks.items()))
+    worst = sorted(by_id.values(), key=lambda one: -_variance(one, config))
+    states = {one.landmark_id for one in worst[: min(len(worst), max(2 * most - len(worst), 0))]}
+    for i in (i for i in by_id if i in states):
+        sigmas |= _landmark_sigmas(i, by_id[i], config, corners)
     sigmas |= ground
     return Installation(
         sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None}, effects, length
     )
+
+
+def _variance(landmark: Landmark, config: Config) -> float:
+    """Prior variance of a landmark's place in the plane [m²]."""
+    return 2.0 * config.map.position_sigma_m**2 if landmark.cov is None else float(landmark.cov[:2, :2].trace())
 
 
 def _landmark_sigmas(i: int, landmark: Landmark, config: Config, corners: bool) -> dict[str, float]:

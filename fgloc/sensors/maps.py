@@ -93,6 +93,7 @@ def _row(values: FloatArray) -> str:
     return f"[{', '.join(repr(float(v)) for v in values)}]"
 
 
+_MAX_BYTES = 5_000_000  # some 50 000 landmarks, 15 s to read; a building has hundreds
 _MAX_SIZE_M = 5.0
 _MAX_POSITION_M = 1e6
 _QUATERNION_TOLERANCE = 0.05
@@ -180,7 +181,7 @@ def load_map(
         MapError: the file cannot be read or is in no known format; or an id is given twice (both lines are named) or is
             negative, a number is not finite, a size is not in metres, or a rotation is not one.
     """
-    root = read_document(path, MapError)
+    root = read_document(path, MapError, _MAX_BYTES)
     builder = _Builder(default_size_m, scale, size_scale)
     if not root.is_mapping:
         raise root.fail("expected keys such as 'landmarks' (ours), 'bodies' (TagSLAM) or 'tags' (WPILib)")

@@ -52,6 +52,21 @@ def test_parameters_of_sigma_zero_are_no_states():
     assert Installation({}).time_offset(Installation({}).prior()) == 0.0
 
 
+def test_a_landmark_more_takes_the_state_of_one_landmark():
+    def states(n):
+        loose = np.diag([0.3, 0.3]) ** 2
+        landmarks = [
+            Landmark(i, np.array([i, 0.0, 0.0]), np.eye(3), 0.0, loose if i == n - 1 else None) for i in range(n)
+        ]
+        return installation_of(config(), LandmarkMap({one.landmark_id: one for one in landmarks}), False).landmarks
+
+    counts = [len(states(n)) for n in range(1, 3 * MOST_LANDMARKS)]
+    assert max(counts) == MOST_LANDMARKS
+    assert np.abs(np.diff(counts)).max() == 1
+    assert counts[-1] == 0
+    assert 99 in states(100)  # the worst known is the last that goes
+
+
 def test_in_a_block_that_holds_others_a_parameter_of_sigma_zero_is_held():
     sigmas = {"map.3.x_m": 0.0, "map.3.y_m": 0.01, "map.4.x_m": 0.0, "map.4.y_m": 0.0, "wheels.track": 0.02}
     made = Installation(sigmas)
@@ -82,7 +97,7 @@ def test_what_is_a_state_depends_on_the_sensors():
     assert not any(
         "." in n and n.split(".")[0] in ("map", "camera") for n in installation_of(config(), None, True).names
     )
-    many = beacons(MOST_LANDMARKS + 1)
+    many = beacons(2 * MOST_LANDMARKS)
     assert not installation_of(config(), many, False).landmarks
 
 

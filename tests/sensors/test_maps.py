@@ -323,3 +323,12 @@ def test_a_run_has_the_map_in_the_units_of_the_settings():
     assert landmark_map is not None
     for i, landmark in load_map(sample / "map.yaml").landmarks.items():
         assert np.allclose(landmark_map.landmarks[i].position, 2.0 * landmark.position)
+
+
+def test_a_map_larger_than_any_building_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "map.yaml"
+    path.write_text("landmarks:\n" + "".join(f"  - {{id: {i}, position: [{i}, 0, 0]}}\n" for i in range(170_000)))
+    began = time.process_time()
+    with pytest.raises(MapError, match="bytes"):
+        load_map(path)
+    assert time.process_time() - began < 1.0
