@@ -17,7 +17,7 @@ BASE_NAMES = ("base_link", "base_footprint", "base")  # what robots call our "ba
 
 def quaternion_yaw(quaternion: Sequence[float] | FloatArray) -> float:
     """Yaw [rad] of a unit quaternion x, y, z, w."""
-    x, y, z, w = quaternion
+    x, y, z, w = map(float, quaternion)  # numpy's numbers warn of an overflow
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 

@@ -243,6 +243,7 @@ class SignalCollector:
         self._fast = EventValidator(reported_bounds(config).model_copy(update=any_speed))
         self._first_ns: int | None = None
         self._values = 0
+        self._delays: dict[str, int] = {}  # of the first message, by topic [ns]
 
     def add(self, event: Event) -> bool:
         """Store the signals of an event; False: it came after the end of the time to be read, or as too many."""
@@ -250,6 +251,9 @@ class SignalCollector:
             self._first_ns = self.found.origin_ns = event.received_ns
         if event.received_ns - self._first_ns > LONGEST_S * 1e9 or self._values >= _MOST_VALUES:
             return False
+        delay = event.received_ns - event.stamp_ns
+        if abs(delay - self._delays.setdefault(event.topic, delay)) > LONGEST_S * 1e9:
+            return True  # its clock jumped, or it never was of this time: what is compared has one grid of times
         self._values += 1
         if isinstance(event, JointsEvent):
             self._values += len(event.names)
@@ -260,12 +264,17 @@ class SignalCollector:
             self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
         if isinstance(event, MotionEvent) and event.odometer is not None:
             row = ((event.stamp_ns - self.found.origin_ns) * 1e-9, *event.odometer.pose, *event.odometer.twist)
-            if all(map(math.isfinite, row)):
+            if all(abs(value) <= _FARTHEST for value in row):  # nor with a NaN in it
                 self.found.odometry.append(row)
         elif isinstance(event, InertialEvent):
             row = ((event.stamp_ns - self.found.origin_ns) * 1e-9, *event.angular_velocity.tolist())
-            if event.stamp_ns > 0 and all(map(math.isfinite, row)):
-                self.found.imu.append((*row, *event.linear_acceleration.tolist()))
+            felt: list[float] = event.linear_acceleration.tolist()
+            if (
+                event.stamp_ns > 0
+                and all(abs(v) <= _FARTHEST for v in row)
+                and not any(abs(v) > _FARTHEST for v in felt)
+            ):
+                self.found.imu.append((*row, *felt))
             return True
         # a driver's twist has spikes; commands and angles have none, and may be in another unit
         gate = self._fast if isinstance(event, (ControlEvent, JointsEvent)) else self._gate

@@ -461,12 +461,17 @@ class Estimation:
             return not self._changed.wait_for(lambda: self._closing or self._failed is not None, seconds)
 
     def _compare_regularly(self) -> None:
-        """Compare signals beside the estimation, which goes on meanwhile."""
+        """Compare signals beside the estimation, which goes on meanwhile, also where this fails."""
         while self._pause(_COMPARE_EVERY_S):
             with self._busy:
                 comparison = self.run.comparison()
-            if comparison is not None:
-                comparison()
+            try:
+                if comparison is not None:
+                    comparison()
+            except Exception as error:
+                with self._changed:
+                    self._notes.setdefault(f"sensors are not compared any more: {unexpected(error, 'the comparison')}")
+                return
 
     def _save_regularly(self) -> None:
         while self._pause(_SAVE_EVERY_S):

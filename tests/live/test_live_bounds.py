@@ -1,14 +1,17 @@
 """What a live run keeps of its inputs is bounded, whatever names come in."""
 
+import dataclasses
 import gc
 import tracemalloc
 
 import numpy as np
 import pytest
+from robot_world import World, beacons, config
 
 from fgloc.config import Config
+from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.live import Live
-from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, TransformEvent
 
 START_NS = 1_000_000_000_000
@@ -59,3 +62,13 @@ def test_joints_and_topics_of_ever_new_names_make_few_notes_and_statistics():
         assert len(status.notes) < MANY / 10
         assert sum(map(len, status.notes)) < 100_000
         assert len(status.topics) < MANY
+
+
+def test_a_stamp_of_another_age_does_not_end_the_comparison_of_sensors():
+    world = World(beacons(), seed=2, seconds=10.0)
+    compared = Diagnosis(config(), world.map, None, np.eye(4), None)
+    for k, event in enumerate(world.events()):
+        compared.add(event)
+        if k > 50 and isinstance(event, OdometryEvent):
+            compared.add(dataclasses.replace(event, stamp_ns=event.stamp_ns + 10**18))
+    assert not compared.findings()
