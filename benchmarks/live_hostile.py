@@ -27,10 +27,11 @@ import numpy as np
 from benchmarks.common import Row, main
 from benchmarks.live_endurance import _resident_mb
 from benchmarks.live_streams import START_NS, circle, circle_config, circle_map, circle_truth
-from fgloc.config import Role
+from fgloc.config import Role, TopicsConfig
 from fgloc.live import Live
 from fgloc.recording.messages import Messages
 from fgloc.recording.reader import events_of
+from fgloc.sensors.base import with_values
 from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.types import Estimate, Event
 
@@ -54,6 +55,7 @@ TOPICS: dict[str, tuple[str, Role | None]] = {
     "/tf": ("tf2_msgs/msg/TFMessage", None),
     "/tf_static": ("tf2_msgs/msg/TFMessage", None),
 }
+_USED: dict[str, str] = {"odometry": "/odom", "imu": "/imu", "sightings": "/landmarks"}
 _WILD = (math.nan, 1e300, -1e300, math.inf, -math.inf, 0.0)
 _STAMPS_S = (3600.0, 1e9, 0.9, -3600.0, -0.9)  # from now
 
@@ -193,7 +195,10 @@ def hostile(count: int, seconds: float) -> Iterator[Row]:
     crashes = pushed = 0
     memory_mb = [0.0]
     each = count * len(topics) / len(own)
-    with Live(circle_config(), circle_map(), roles=("odometry", "imu", "sightings")) as live:
+    config = with_values(
+        circle_config(), "recording", {"topics": TopicsConfig(**_USED)}
+    )  # else the first topic of a role is used
+    with Live(config, circle_map(), roles=("odometry", "imu", "sightings")) as live:
         live.subscribe(made.append)
         try:
             for k, event in enumerate(own):
