@@ -66,7 +66,7 @@ def exchange(peer: Path, count: int, domain: int) -> tuple[int, int]:
 def _send(outputs: Outputs, count: int) -> None:
     """Numbered Odometry, once there is a reader."""
     deadline = time.monotonic() + _PATIENCE_S
-    while not outputs.readers("odometry") and time.monotonic() < deadline:
+    while not outputs.readers("~/odometry") and time.monotonic() < deadline:
         time.sleep(0.01)
     for k in range(count):
         x = 0.5 * k

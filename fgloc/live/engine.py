@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
+from fgloc.assembly import Assembly
 from fgloc.config import Config, Role, TopicsConfig
 from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -205,6 +206,14 @@ class Settings:
     camera: Camera | None
 
 
+class Keep(Enum):
+    """Part of what a run knows that it goes on with when it begins again."""
+
+    NOTHING = "nothing"
+    INSTALLATION = "installation, bias of the gyro, and moved landmarks, but not the pose"
+    ALL = "the pose too"
+
+
 class Estimation:
     """Events go in by `put`, from any thread; estimates come out in the estimation thread.
 
@@ -310,6 +319,33 @@ class Estimation:
             write_state(path, snapshot)
         return snapshot is not None
 
+    def begin_again(self, keep: Keep, source: LandmarkMap | Path | None = None) -> None:
+        """Estimate anew; see `Live.reset`, `search`, `load` and `use_map`.
+
+        Args:
+            keep: of what is known now.
+            source: a map to go on with, or the file of a state to go on from; None: neither.
+
+        Raises:
+            EstimatorError: no state can be read from the file.
+            FglocError: the sensors of this run cannot use the map.
+        """
+        with self._busy:
+            landmark_map = source if isinstance(source, LandmarkMap) else self.run.map
+            state = None if keep is Keep.NOTHING else self.run.snapshot()
+            if state is not None and keep is Keep.INSTALLATION:
+                state = state.model_copy(update={"mode": Mode.LOST})
+            if isinstance(source, Path):
+                read = read_state(source, fingerprint(landmark_map), "the run goes on as it was")
+                if read.state is None:
+                    raise EstimatorError(
+                        read.note or f"{source}: no such file; give one that `save` or `--state` wrote"
+                    )
+                state = read.state
+            self.run.begin_again(landmark_map, state)
+            if self.run.parts is not None:
+                self._parts_are_built(self.run.parts)
+
     def close(self) -> None:
         """Use what is queued, but for images, save the state, and end the threads; see `Live.close`."""
         with self._changed:
@@ -397,8 +433,10 @@ class Estimation:
                 self._admit(self._held.popleft())
 
     def _build(self) -> None:
-        detector = self.run.build().detector
-        self._worker.detector = None if detector is None else detector.following()
+        self._parts_are_built(self.run.build())
+
+    def _parts_are_built(self, parts: Assembly) -> None:
+        self._worker.detector = None if parts.detector is None else parts.detector.following()
         assert self.run.anchors is not None
         self._outlet.built(self.run.anchors.parts)
 

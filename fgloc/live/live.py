@@ -19,7 +19,7 @@ from fgloc.errors import EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.intake.clocks import Source, TopicClocks, source_of
 from fgloc.intake.validation import EventValidator, reported_bounds
-from fgloc.live.engine import Estimation, LiveStatus, Settings, TopicStatus
+from fgloc.live.engine import Estimation, Keep, LiveStatus, Settings, TopicStatus
 from fgloc.live.extrapolation import Anchor, Extrapolator, LivePose, MotionParts
 from fgloc.live.process import EstimationProcess
 from fgloc.live.run import MOST_NAMES, LiveFacts, role_name
@@ -220,7 +220,7 @@ class Live(registry.SensorInput):
         if isinstance(landmark_map, Path):
             landmark_map = configured_map(landmark_map, config)
         learned_motion(config, None)  # refuses a file now, not when the robot drives
-        self._recording = config.recording
+        self._config, self._recording = config, config.recording
         self._lock = threading.RLock()  # of the reception: events go on in the order in which they came
         self._reception = Reception(config)
         self._results = _Results(config)
@@ -271,6 +271,40 @@ class Live(registry.SensorInput):
         if not (mean.shape == spread.shape == (3,) and np.isfinite([mean, spread]).all() and (spread > 0.0).all()):
             raise EstimatorError(f"pose {pose} with sigmas {sigmas}; expected three finite values and sigmas above 0")
         self._estimation.reset_pose(PoseWithCovariance(mean, np.diag(spread**2)))
+
+    def search(self) -> None:
+        """Forget the pose and search for it on the map; what is known of the robot (installation, biases) is kept.
+
+        Raises:
+            FglocError: the run has failed or is closed.
+        """
+        self._estimation.begin_again(Keep.INSTALLATION)
+
+    def reset(self) -> None:
+        """Begin anew, as at the start; frames and calibration that have come in are known.
+
+        Raises:
+            FglocError: the run has failed or is closed.
+        """
+        self._estimation.begin_again(Keep.NOTHING)
+
+    def load(self, path: Path) -> None:
+        """Go on from a state that `save` wrote, perhaps in an earlier run on the same map.
+
+        Raises:
+            EstimatorError: no such file, it is damaged, or of another map; the run goes on as it was.
+        """
+        self._estimation.begin_again(Keep.NOTHING, path)
+
+    def use_map(self, landmark_map: LandmarkMap | Path) -> None:
+        """Go on with another map, or with the file of the map after a change, from the same pose and installation.
+
+        Raises:
+            MapError: as its loader has it; the run goes on as it was.
+        """
+        if isinstance(landmark_map, Path):
+            landmark_map = configured_map(landmark_map, self._config)
+        self._estimation.begin_again(Keep.ALL, landmark_map)
 
     def subscribe(self, callback: Callable[[Estimate], None]) -> None:
         """Call a function with every keyframe's estimate, in the thread that has it: it should be quick.

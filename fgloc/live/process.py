@@ -30,10 +30,10 @@ from typing import Any, TypeAlias
 from fgloc.config import TopicsConfig
 from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.engine import Estimation, LiveStatus, Settings
+from fgloc.live.engine import Estimation, Keep, LiveStatus, Settings
 from fgloc.live.extrapolation import Anchor, MotionParts, Outlet
 from fgloc.live.run import role_name
-from fgloc.types import Estimate, Event, MotionEvent, RawEvent, SensorEvent, SightingsEvent
+from fgloc.types import Estimate, Event, LandmarkMap, MotionEvent, RawEvent, SensorEvent, SightingsEvent
 
 _START = "import json, sys; sys.path[:] = json.loads(sys.argv[2]); from fgloc.live.process import main; main()"
 _MOST_WAITING = 20_000  # events that wait for being sent: 30 s of a busy robot
@@ -139,6 +139,10 @@ class EstimationProcess:
     def save(self, path: Path) -> bool:
         """Save the state now; see `Estimation.save`."""
         return bool(self._ask("save", path).result())
+
+    def begin_again(self, keep: Keep, source: LandmarkMap | Path | None = None) -> None:
+        """Estimate anew; see `Estimation.begin_again`."""
+        self._ask("begin_again", keep, source).result()
 
     def close(self) -> None:
         """End the run and the process; see `Estimation.close`."""

@@ -267,6 +267,7 @@ class OnlineRun:
         facts: what has come in.
         parts: of the run; None before they are built.
         anchors: of its estimates; None before.
+        map: the known map; None: landmarks are estimated.
         newest: the last estimate.
         keyframes: steps so far.
         reordering_s: how far the last keyframe was behind the newest stamp when it was made.
@@ -290,7 +291,7 @@ class OnlineRun:
         self.keyframes = 0
         self.reordering_s = 0.0
         self._config = config
-        self._map = landmark_map
+        self.map = landmark_map
         self._fingerprint = fingerprint(landmark_map)
         self._resumed = resumed
         self._reset: PoseWithCovariance | None = None  # a pose that was given, for the next step
@@ -310,11 +311,27 @@ class OnlineRun:
         if old is not None:
             self._resumed = self.snapshot() or self._resumed
             self._past_rejections += old.rejections
-        parts = assemble_stream(self.facts, self._map, self._config, keep_all=self._map is None)
-        if self._resumed is not None:
-            self._take_over(parts, self._resumed)
-        self.parts = parts
-        self.anchors = Anchors(parts)
+        return self._begin(self.map, self._resumed)
+
+    def begin_again(self, landmark_map: LandmarkMap | None, state: RunState | None) -> None:
+        """Go on with another map (or the same) and from a state; None: the start is fresh.
+
+        Parts that are built already are built anew, from what the stream has told so far.
+
+        Raises:
+            FglocError: as `build`; everything is then as before.
+        """
+        if (old := self.parts) is not None:
+            self._begin(landmark_map, state)
+            self._past_rejections += old.rejections
+        self.map, self._fingerprint = landmark_map, fingerprint(landmark_map)
+        self._resumed, self._reset, self.newest, self._notes = state, None, None, []
+
+    def _begin(self, landmark_map: LandmarkMap | None, state: RunState | None) -> Assembly:
+        parts = assemble_stream(self.facts, landmark_map, self._config, keep_all=landmark_map is None)
+        if state is not None:
+            self._take_over(parts, state)
+        self.parts, self.anchors = parts, Anchors(parts)
         return parts
 
     def reset_pose(self, belief: PoseWithCovariance) -> None:

@@ -99,11 +99,13 @@ def write_state(path: Path, state: RunState) -> None:
         json.dump({"sha256": _checksum(body), "state": body}, file)
 
 
-def read_state(path: Path, map_fingerprint: str) -> Resumed:
+_FRESH = "it is not used, the start is fresh, and the file will be replaced"
+
+
+def read_state(path: Path, map_fingerprint: str, remedy: str = _FRESH) -> Resumed:
     """Read the state of an earlier run; a file that is damaged, or of another map, is refused with a note."""
     if not path.exists():
         return Resumed(None, "")
-    remedy = "it is not used, the start is fresh, and the file will be replaced"
     try:
         content = json.loads(read_text(path, OutputError, "give a file that `--state` wrote"))
         body, checksum = content["state"], content["sha256"]

@@ -42,10 +42,10 @@ def pose_stamped(stamp_ns: int, pose: FloatArray) -> Message:
 
 
 def pose_with_covariance_stamped(
-    stamp_ns: int, pose: FloatArray, cov: FloatArray, ground: Ground | None = None
+    stamp_ns: int, pose: FloatArray, cov: FloatArray, ground: Ground | None = None, frame: str = MAP_FRAME
 ) -> Message:
     """geometry_msgs/PoseWithCovarianceStamped in the map."""
-    return {"header": header(stamp_ns, MAP_FRAME), "pose": pose_with_covariance(pose, cov, ground)}
+    return {"header": header(stamp_ns, frame), "pose": pose_with_covariance(pose, cov, ground)}
 
 
 def odometry(
@@ -56,22 +56,25 @@ def odometry(
     base_frame: str,
     twist_cov: FloatArray | None = None,
     ground: Ground | None = None,
+    frame: str = MAP_FRAME,
 ) -> Message:
     """nav_msgs/Odometry of the base in the map; ``twist (3,)`` and its covariance are in the base's axes."""
     covariance = {} if twist_cov is None else {"covariance": _spatial(twist_cov)}
     return {
-        "header": header(stamp_ns, MAP_FRAME),
+        "header": header(stamp_ns, frame),
         "child_frame_id": base_frame,
         "pose": pose_with_covariance(pose, cov, ground),
         "twist": {"twist": {"linear": xyz(*twist[:2]), "angular": xyz(z=twist[2])}, **covariance},
     }
 
 
-def transform(stamp_ns: int, T_map_child: FloatArray, child_frame: str, ground: Ground | None = None) -> Message:
+def transform(
+    stamp_ns: int, T_map_child: FloatArray, child_frame: str, ground: Ground | None = None, frame: str = MAP_FRAME
+) -> Message:
     """tf2_msgs/TFMessage with one transform from the map."""
     pose = _pose(T_map_child, ground)
     value = {"translation": pose["position"], "rotation": pose["orientation"]}
-    return {"transforms": [{"header": header(stamp_ns, MAP_FRAME), "child_frame_id": child_frame, "transform": value}]}
+    return {"transforms": [{"header": header(stamp_ns, frame), "child_frame_id": child_frame, "transform": value}]}
 
 
 def path(stamps_ns: Iterable[int], poses: Iterable[FloatArray], stamp_ns: int) -> Message:
@@ -81,22 +84,25 @@ def path(stamps_ns: Iterable[int], poses: Iterable[FloatArray], stamp_ns: int) -
 
 
 def diagnostics(
-    stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str], wrong: bool = False
+    stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str], wrong: bool = False, name: str = "fgloc"
 ) -> Message:
-    """diagnostic_msgs/DiagnosticArray; ``mode`` None: there is no pose yet; ``wrong``: it is not to be trusted."""
+    """diagnostic_msgs/DiagnosticArray; ``mode`` None: there is no pose yet; ``wrong``: it is not to be trusted.
+
+    ``name`` is that of the node.
+    """
     status = {
         "level": _LEVEL[Mode.LOST] if wrong else STALE if mode is None else _LEVEL[mode],
-        "name": "fgloc: localization",
+        "name": f"{name}: localization",
         "message": message,
-        "hardware_id": "fgloc",
+        "hardware_id": name,
         "values": [{"key": key, "value": value} for key, value in values.items()],
     }
     return {"header": header(stamp_ns, ""), "status": [status]}
 
 
-def map_markers(landmarks: LandmarkMap, stamp_ns: int = 0) -> Message:
+def map_markers(landmarks: LandmarkMap, stamp_ns: int = 0, frame: str = MAP_FRAME) -> Message:
     """visualization_msgs/MarkerArray: a plate (a ball for a point) for each landmark, and its number above it."""
-    return {"markers": [m for landmark in landmarks.landmarks.values() for m in _markers(landmark, stamp_ns)]}
+    return {"markers": [m for landmark in landmarks.landmarks.values() for m in _markers(landmark, stamp_ns, frame)]}
 
 
 def rotation(yaw: float) -> dict[str, float]:
@@ -124,10 +130,10 @@ def _spatial(cov: FloatArray) -> FloatArray:
     return covariance.ravel()
 
 
-def _markers(landmark: Landmark, stamp_ns: int) -> list[Message]:
+def _markers(landmark: Landmark, stamp_ns: int, frame: str) -> list[Message]:
     size, point = landmark.size_m or _POINT_M, landmark.size_m == 0.0
     x, y, z = landmark.position
-    shared = {"header": header(stamp_ns, MAP_FRAME), "id": landmark.landmark_id, "color": _WHITE}
+    shared = {"header": header(stamp_ns, frame), "id": landmark.landmark_id, "color": _WHITE}
     quaternion = dict(zip("xyzw", Rotation.from_matrix(landmark.rotation).as_quat().tolist(), strict=True))
     body = {
         **shared,

@@ -1,4 +1,4 @@
-"""``fgloc live`` as a participant: topics of the wire as events into `Live`, its poses out."""
+"""A live run on a network: its topics as events into `Live`, the poses out. ``fgloc live`` and ROS's node share it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,20 @@ import numpy as np
 from fgloc.config import Config, RecordingConfig, Role, base_role
 from fgloc.errors import FglocError, WireError
 from fgloc.frames import quaternion_yaw
-from fgloc.live import Live, LiveStatus
+from fgloc.live import Live, LivePose, LiveStatus
 from fgloc.live.process import EstimationProcess
 from fgloc.live.run import MOTION
 from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, odom_in_map
-from fgloc.live.wire.participant import OWN, Participant, Publication, Sample, WireClock
+from fgloc.live.wire.transport import Clock, Publication, Received, Transport
 from fgloc.recording.reader import TF_TYPES, TopicInfo, events_of, select_roles, topic_key
 from fgloc.recording.standard_messages import MAP_FRAME
-from fgloc.types import Estimate, Event, LandmarkMap, Severity
+from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Severity
 
 # --- Intake: topics found by type, selected by role, decoded as those of a recording ----------------------------------
 
 SETTLED_S = 1.0  # no new topic for this long: all of a robot's have been found
 LOOK: tuple[Role, ...] = ("image", "sightings")
-_TF_TOPICS = ("/tf", "/tf_static")
-_LATCHED = frozenset({"/tf_static"})
+_TF, _TF_STATIC = "/tf", "/tf_static"
 
 
 class Intake:
@@ -43,10 +43,10 @@ class Intake:
     """
 
     def __init__(
-        self, participant: Participant, clock: WireClock, config: RecordingConfig, push: Callable[[Event, str], None]
+        self, transport: Transport, clock: Clock, config: RecordingConfig, push: Callable[[Event, str], None]
     ) -> None:
-        """Watch the wire; `find` looks for topics, `subscribe` reads them."""
-        self._participant = participant
+        """Watch the network; `find` looks for topics, `subscribe` reads them."""
+        self._transport = transport
         self._clock = clock
         self._config = config
         self._push = push
@@ -69,7 +69,8 @@ class Intake:
         Raises:
             WireError: several topics could play one role, or a configured one has another type.
         """
-        found = tuple(p for p in self._participant.publications() if not p.topic.startswith(OWN))
+        own = self._transport.full_name("~/")
+        found = tuple(p for p in self._transport.publications() if not p.topic.startswith(own))
         if found != self._found:
             self._found, self._changed_s = found, time.monotonic()
         if time.monotonic() - self._changed_s < SETTLED_S:
@@ -88,18 +89,20 @@ class Intake:
     def subscribe(self) -> list[tuple[Role, str]]:
         """Read what was found and is not read yet; the roles and topics that are new."""
         types = {p.topic: p.message_type for p in self._found}
-        for topic in _TF_TOPICS:
+        for name in (_TF, _TF_STATIC):
+            topic, latched = self._transport.full_name(name), name == _TF_STATIC
             if self.roles and types.get(topic) in TF_TYPES and topic not in self._role_of:
                 self._role_of[topic] = None
-                self._participant.read(topic, types[topic], self._on_sample, latched=topic in _LATCHED)
-            if topic in self._role_of and topic in _LATCHED - self._also and self._participant.has_volatile(topic):
+                self._transport.read(topic, types[topic], self._on_message, latched=latched)
+            is_new = latched and topic in self._role_of and topic not in self._also
+            if is_new and self._transport.has_volatile(topic):
                 self._also.add(topic)
-                self._participant.read(topic, types[topic], self._on_sample)
+                self._transport.read(topic, types[topic], self._on_message)
         new = [(role, topic) for role, topic in self.roles.items() if topic not in self._role_of and topic in types]
         new = [(role, topic) for role, topic in new if self.truth or role != "truth"]
         for role, topic in new:
             self._role_of[topic] = role
-            self._participant.read(topic, types[topic], self._on_sample)
+            self._transport.read(topic, types[topic], self._on_message)
         return new
 
     def _missing(self, roles: Mapping[Role, str]) -> str:
@@ -118,19 +121,20 @@ class Intake:
         there = ", ".join(f"{p.topic} ({p.message_type})" for p in self._found) or "none"
         return f"Waiting for {' and '.join(lacking)}; topics there: {there}." if lacking else ""
 
-    def _on_sample(self, sample: Sample) -> None:
+    def _on_message(self, message: Received) -> None:
+        topic = message.topic
         with self._counting:
-            self.received[sample.topic] += 1
+            self.received[topic] += 1
         try:
-            content = self._participant.messages.decode(sample.message_type, sample.cdr)
-            role, received_ns = self._role_of[sample.topic], self._clock.received_ns(sample)
-            events = events_of(content, sample.message_type, role, received_ns, sample.topic, self._config)
+            content = self._transport.decode(message)
+            role, received_ns = self._role_of[topic], self._clock.received_ns(message)
+            events = events_of(content, message.message_type, role, received_ns, topic, self._config)
         except Exception:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
             with self._counting:
-                self.undecodable[sample.topic] += 1
+                self.undecodable[topic] += 1
             return
         for event in events:
-            self._push(event, sample.publisher)
+            self._push(event, message.publisher)
 
 
 # --- What the user is told: each thing once ---------------------------------------------------------------------------
@@ -169,12 +173,24 @@ class Teller:
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
 _ASKED_EVERY = 3  # turns: the motion sources are read at 17 Hz, which is most of the work; between, the speed is held
 _POLL_S = 0.2  # time between two looks at what there is on the wire
-_INITIAL_POSE = "/initialpose"
+_INITIAL_POSE = "initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
+@dataclass(frozen=True, slots=True)
+class Publishing:
+    """How poses are published."""
+
+    rate_hz: float = RATE_HZ  # of the odometry
+    map_frame: str = MAP_FRAME
+    odom_frame: str = ""  # empty: as messages say
+    tf: bool = True
+    tf_ahead_s: float = 0.0  # added to the stamps of /tf, so that it need not be waited for
+    name: str = "fgloc"  # in the diagnostics
+
+
 class Node:
-    """One live run on the wire. Use `run`, then `close`.
+    """One live run on a network. Use `run`, then `close`.
 
     Attributes:
         live: the run; None until the topics that it needs are there.
@@ -186,49 +202,62 @@ class Node:
 
     def __init__(
         self,
-        participant: Participant,
+        transport: Transport,
         config: Config,
         landmarks: LandmarkMap | None,
         state: Path | None = None,
+        publishing: Publishing | None = None,
+        process: EstimationProcess | None = None,
     ) -> None:
         """Announce the outputs; input is looked for by `run`.
 
         Args:
-            participant: on the wire.
+            transport: the network.
             config: all settings.
             landmarks: the map; None: landmarks are estimated.
             state: as `Live` has it.
+            publishing: rate and frames; None: the usual ones.
+            process: the process to estimate in, if it was started before.
         """
         self.live: Live | None = None
-        self._process = EstimationProcess()  # publishing does not wait for an update
+        self._process = process or EstimationProcess()  # publishing does not wait for an update
+        self._as = publishing or Publishing()
         self._config = config
         self._landmarks = landmarks
         self._state = state
         self.watch: Callable[[Event], None] | None = None
         self._subscribers: list[Callable[[Estimate], None]] = [self._on_estimate]
-        self._clock = WireClock(participant)
-        self._outputs = Outputs(participant)
-        self._odom = OdomFrame(config.recording, config.gate.max_position)
-        self.intake = Intake(participant, self._clock, config.recording, self._push)
+        self._transport = transport
+        self._clock = transport.clock()
+        self._outputs = Outputs(transport, self._as.map_frame, self._as.name)
+        self._odom = OdomFrame(config.recording, config.gate.max_position, self._as.odom_frame)
+        self.intake = Intake(transport, self._clock, config.recording, self._push)
         self.published: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
-        self._messages = participant.messages
         self._failure: FglocError | None = None
         self._notes: list[str] = []  # to be told
         self._given: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # pose and sigmas, before the run begins
         self._stopping = threading.Event()
         self._turn = 0  # of publishing
         self._last_ns = 0  # stamp of the last odometry published
-        self._last_odom_ns = 0
+        self._T_map_odom: dict[str, FloatArray] = {}  # by name of the odometry frame
         if landmarks is not None:
             self._outputs.map(landmarks)
-        participant.read(_INITIAL_POSE, _INITIAL_POSE_TYPE, self._on_initial_pose)
+        self._given_by = transport.full_name(_INITIAL_POSE)
+        transport.read(self._given_by, _INITIAL_POSE_TYPE, self._on_initial_pose)
 
     def close(self) -> None:
         """End the run, and save its state."""
         if self.live is not None:
             self.live.close()
         self._process.close()
+
+    def use_map(self, landmarks: LandmarkMap) -> None:
+        """Go on with another map, see `Live.use_map`; it is published too."""
+        if self.live is not None:
+            self.live.use_map(landmarks)
+        self._landmarks = landmarks
+        self._outputs.map(landmarks)
 
     def subscribe(self, callback: Callable[[Estimate], None]) -> None:
         """Call a function with every estimate, see `Live.subscribe`; to be called before `run`."""
@@ -301,18 +330,18 @@ class Node:
         self._outputs.pose(estimate)
         self.published["pose"] += 1
 
-    def _on_initial_pose(self, sample: Sample) -> None:
+    def _on_initial_pose(self, given: Received) -> None:
         """Take a pose that a person gave; one of any other content is counted and said, and the run goes on."""
         try:
-            message = self._messages.decode(sample.message_type, sample.cdr)
+            message = self._transport.decode(given)
             frame = message.header.frame_id.lstrip("/")
-            if frame not in ("", MAP_FRAME):
-                raise ValueError(f"it is in frame {frame!r}, expected {MAP_FRAME!r}")
+            if frame not in ("", self._as.map_frame):
+                raise ValueError(f"it is in frame {frame!r}, expected {self._as.map_frame!r}")
             self._given = self._planar(message.pose)
         except Exception as error:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
-            self.refused[_INITIAL_POSE] += 1
+            self.refused[self._given_by] += 1
             why = error if isinstance(error, ValueError) and not isinstance(error, UnicodeError) else "it is damaged"
-            self._notes.append(f"{_INITIAL_POSE} is not used: {why}.")
+            self._notes.append(f"{self._given_by} is not used: {why}.")
             return
         if self.live is not None:
             self._take_given(self.live)
@@ -344,8 +373,8 @@ class Node:
         try:
             live.reset_pose(*given)
         except FglocError as error:
-            self.refused[_INITIAL_POSE] += 1
-            self._notes.append(f"{_INITIAL_POSE} is not used: {error}.")
+            self.refused[self._given_by] += 1
+            self._notes.append(f"{self._given_by} is not used: {error}.")
 
     def _take_notes(self) -> list[str]:
         notes, self._notes = self._notes, []
@@ -353,7 +382,7 @@ class Node:
 
     def _publish(self) -> None:
         """Publish at `RATE_HZ` until the end; a turn that comes too late is left out."""
-        period_s = 1.0 / RATE_HZ
+        period_s = 1.0 / self._as.rate_hz
         due = time.monotonic()
         while not self._stopping.is_set():
             due = max(due + period_s, time.monotonic())
@@ -375,14 +404,28 @@ class Node:
         if ahead is None:
             self._recent.add(now)
         self._last_ns = now.stamp_ns
-        base, odom = self._odom.base, self._odom.latest()
+        base = self._odom.base
         self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist(), now.ground), base)
         self.published["odometry"] += 1
-        if odom is None:
-            self._outputs.transform(now.stamp_ns, now.pose, base)
-        elif odom.stamp_ns != self._last_odom_ns and (then := self._recent.at(odom.stamp_ns)) is not None:
-            self._last_odom_ns = odom.stamp_ns
-            self._outputs.transform(odom.stamp_ns, odom_in_map(then, odom.T_odom_base), odom.frame)
+        if self._as.tf:
+            self._publish_transforms(now, base)
+
+    def _publish_transforms(self, now: LivePose, base: str) -> None:
+        """Publish ``map → odom`` for each pose of the odometry, else ``map → base``.
+
+        The transform of an odometry's pose that is newer than those asked for is the one before: it changes only by
+        the odometry's error.
+        """
+        ahead_ns = round(self._as.tf_ahead_s * 1e9)
+        if self._odom.latest() is None:
+            return self._outputs.transform(now.stamp_ns + ahead_ns, now.pose, base)
+        for odom in self._odom.take(now.stamp_ns):
+            then = self._recent.at(odom.stamp_ns)
+            if then is not None:
+                self._T_map_odom = {odom.frame: odom_in_map(then, odom.T_odom_base)}
+            if (known := self._T_map_odom.get(odom.frame)) is not None:
+                self._outputs.transform(odom.stamp_ns + ahead_ns, known, odom.frame)
+        return None
 
     def _diagnose(self, status: LiveStatus | None) -> None:
         mode = None if status is None or status.stale else status.mode

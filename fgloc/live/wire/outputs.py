@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from fgloc import se2
 from fgloc.config import RecordingConfig
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.live import LivePose
-from fgloc.live.wire.participant import OWN, Participant
+from fgloc.live.wire.transport import Transport
 from fgloc.recording import standard_messages as standard
 from fgloc.types import Estimate, Event, FloatArray, Ground, LandmarkMap, Mode, MotionEvent, TransformEvent
 
@@ -31,14 +31,22 @@ class OdomPose:
 
 
 _MOST_FRAMES = 1000  # names that are kept: a robot has tens
+_MOST_NEW = 100  # poses that wait for being published: 0.5 s of a fast odometry
 
 
 class OdomFrame:
     """Collects the robot's frames and its odometry from messages."""
 
-    def __init__(self, config: RecordingConfig, farthest_m: float = 1e6) -> None:
-        """Start without messages; a pose further off than this, or none at all, is not taken."""
-        self._config, self._farthest_m = config, farthest_m
+    def __init__(self, config: RecordingConfig, farthest_m: float = 1e6, only: str = "") -> None:
+        """Start without messages.
+
+        Args:
+            config: name of the base frame, if it is given.
+            farthest_m: a pose further off than this, or none at all, is not taken.
+            only: name of the odometry frame; empty: as messages say.
+        """
+        self._config, self._farthest_m, self._only = config, farthest_m, only
+        self._new: deque[OdomPose] = deque(maxlen=_MOST_NEW)
         self._lock = threading.Lock()
         self._frames: set[str] = set()
         self._child = ""  # of the odometry
@@ -52,16 +60,21 @@ class OdomFrame:
                 return
             with self._lock:
                 self._child = event.base_frame_id.lstrip("/")
-                self._by_topic = OdomPose(event.stamp_ns, told.frame_id.lstrip("/") or "odom", told.pose)
+                frame = told.frame_id.lstrip("/") or "odom"
+                if self._only in ("", frame):
+                    self._by_topic = OdomPose(event.stamp_ns, frame, told.pose)
+                    if self._by_tf is None:
+                        self._new.append(self._by_topic)
         elif isinstance(event, TransformEvent):
             parent, child = event.parent.lstrip("/"), event.child.lstrip("/")
             with self._lock:
                 if len(self._frames) < _MOST_FRAMES:
                     self._frames.update((parent, child))
-                if not event.static and child == self._base():
+                if not event.static and child == self._base() and self._only in ("", parent):
                     pose = _planar(event.translation, event.rotation)
                     if self._plausible(pose):
                         self._by_tf = OdomPose(event.stamp_ns, parent, pose)
+                        self._new.append(self._by_tf)
 
     def _plausible(self, pose: FloatArray) -> bool:
         return bool(np.isfinite(pose).all() and np.abs(pose[:2]).max() <= self._farthest_m)
@@ -76,6 +89,14 @@ class OdomFrame:
         """The newest pose: of the transform that leads to the base, where there is one, else of the odometry."""
         with self._lock:
             return self._by_tf or self._by_topic
+
+    def take(self, until_ns: int) -> list[OdomPose]:
+        """Poses up to a time that were not taken before."""
+        with self._lock:
+            taken = []
+            while self._new and self._new[0].stamp_ns <= until_ns:
+                taken.append(self._new.popleft())
+            return taken
 
     def _base(self) -> str:
         if self._config.base_frame is not None:
@@ -196,54 +217,69 @@ class BaseState:
 
 
 class Outputs:
-    """Writers of everything that ``fgloc live`` publishes."""
+    """Writers of everything that a live run publishes."""
 
-    def __init__(self, participant: Participant) -> None:
-        """Announce the topics."""
-        self._messages = participant.messages
-        self._types = {
-            OWN + "odometry": "nav_msgs/msg/Odometry",
-            OWN + "pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-            "/tf": "tf2_msgs/msg/TFMessage",
-            "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
-            OWN + "map": "visualization_msgs/msg/MarkerArray",
-        }
+    TYPES: ClassVar = {
+        "~/odometry": "nav_msgs/msg/Odometry",
+        "~/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+        "~/map": "visualization_msgs/msg/MarkerArray",
+    }
+    LATCHED: ClassVar = frozenset({"~/map"})
+
+    def __init__(self, transport: Transport, map_frame: str = standard.MAP_FRAME, name: str = "fgloc") -> None:
+        """Announce the topics.
+
+        Args:
+            transport: network.
+            map_frame: name of the frame of all poses.
+            name: of the node, in the diagnostics.
+        """
+        self._frame, self._name = map_frame, name
         self._writers = {
-            topic: participant.writer(topic, kind, latched=topic == OWN + "map") for topic, kind in self._types.items()
+            topic: transport.writer(transport.full_name(topic), kind, latched=topic in self.LATCHED)
+            for topic, kind in self.TYPES.items()
         }
 
-    def readers(self, name: str) -> int:
-        """Number of readers of one of fgloc's own topics: "odometry", "pose" or "map"."""
-        return self._writers[OWN + name].readers
+    def readers(self, topic: str) -> int:
+        """Number of readers of one of the `TYPES`."""
+        return self._writers[topic].readers
 
     def odometry(self, state: BaseState, base_frame: str) -> None:
         """Publish nav_msgs/Odometry of the base in the map."""
         values = standard.odometry(
-            state.stamp_ns, state.pose, state.cov, state.twist, base_frame, state.twist_cov, state.ground
+            state.stamp_ns,
+            state.pose,
+            state.cov,
+            state.twist,
+            base_frame,
+            state.twist_cov,
+            state.ground,
+            frame=self._frame,
         )
-        self._write(OWN + "odometry", values)
+        self._writers["~/odometry"].publish(values)
 
     def pose(self, estimate: Estimate) -> None:
         """Publish one keyframe's estimate."""
-        values = standard.pose_with_covariance_stamped(estimate.stamp_ns, estimate.pose, estimate.cov, estimate.ground)
-        self._write(OWN + "pose", values)
+        e = estimate
+        values = standard.pose_with_covariance_stamped(e.stamp_ns, e.pose, e.cov, e.ground, frame=self._frame)
+        self._writers["~/pose"].publish(values)
 
     def transform(self, stamp_ns: int, T_map_child: FloatArray, child_frame: str) -> None:
         """Publish ``T_map_child (3,)`` on /tf."""
-        self._write("/tf", standard.transform(stamp_ns, T_map_child, child_frame))
+        self._writers["/tf"].publish(standard.transform(stamp_ns, T_map_child, child_frame, frame=self._frame))
 
     def diagnostics(
         self, stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str], wrong: bool
     ) -> None:
         """Publish the state; arguments as `standard_messages.diagnostics` has them."""
-        self._write("/diagnostics", standard.diagnostics(stamp_ns, mode, message, values, wrong))
+        content = standard.diagnostics(stamp_ns, mode, message, values, wrong, self._name)
+        self._writers["/diagnostics"].publish(content)
 
     def map(self, landmarks: LandmarkMap) -> None:
-        """Publish the map, once: late subscribers get it too."""
-        self._write(OWN + "map", standard.map_markers(landmarks))
-
-    def _write(self, topic: str, values: Mapping[str, Any]) -> None:
-        self._writers[topic].write(self._messages.encode(self._types[topic], values))
+        """Publish the map: late subscribers get it too."""
+        self._writers["~/map"].publish(standard.map_markers(landmarks, frame=self._frame))
 
 
 def odom_in_map(T_map_base: FloatArray, T_odom_base: FloatArray) -> FloatArray:

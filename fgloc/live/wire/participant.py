@@ -9,10 +9,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 from fgloc.errors import WireError
+from fgloc.live.wire.transport import Publication, Received, received_ns
 from fgloc.recording.messages import FieldLayout, Messages
 
 if TYPE_CHECKING:
@@ -135,14 +137,6 @@ _domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
 _domains_lock = threading.Lock()
 
 
-@dataclass(frozen=True, slots=True)
-class Publication:
-    """Topic that another participant publishes."""
-
-    topic: str
-    message_type: str  # "pkg/msg/Name"
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
     """One message as it was received."""
@@ -170,9 +164,17 @@ class _Reader:
 class Writer:
     """Publishes messages on one topic."""
 
-    def __init__(self, writer: Any, kind: type[Any]) -> None:
+    def __init__(
+        self, writer: Any, kind: type[Any], encode: Callable[[Mapping[str, Any]], bytes] | None = None
+    ) -> None:
         self._writer = writer
         self._kind = kind
+        self._encode = encode
+
+    def publish(self, values: Mapping[str, Any]) -> None:
+        """Send a message, given as `Messages.encode` has it."""
+        assert self._encode is not None
+        self.write(self._encode(values))
 
     def write(self, cdr: bytes, source_ns: int | None = None) -> None:
         """Send one message; ``source_ns``: the time that readers see as that of writing; None: now."""
@@ -252,6 +254,18 @@ class Participant:
         self._topics.clear()
         del self._waiting, self._changed, self._found, self._participant, self._domain
 
+    def full_name(self, name: str) -> str:
+        """Full name of a topic; see `Transport.full_name`."""
+        return OWN + name[2:] if name.startswith("~/") else "/" + name.lstrip("/")
+
+    def clock(self) -> WireClock:
+        """Clock of the wire."""
+        return WireClock(self)
+
+    def decode(self, sample: Sample) -> Any:
+        """Content of a message. Raises whatever rosbags leaks on damaged bytes."""
+        return self.messages.decode(sample.message_type, sample.cdr)
+
     def publications(self) -> tuple[Publication, ...]:
         """Topics that others publish now, sorted by name.
 
@@ -284,7 +298,8 @@ class Participant:
         from cyclonedds.pub import DataWriter
         from cyclonedds.qos import Policy, Qos
 
-        entity = self._topic(topic, message_type, messages or self.messages)
+        types = messages or self.messages
+        entity = self._topic(topic, message_type, types)
         qos = Qos(
             Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)),
             Policy.History.KeepLast(_SENT_DEPTH),
@@ -292,7 +307,8 @@ class Participant:
             Policy.DurabilityService(0, Policy.History.KeepLast(_LATCHED_DEPTH), -1, -1, -1),
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
-        return Writer(DataWriter(self._participant, entity, qos=qos), entity.data_type)
+        writer = DataWriter(self._participant, entity, qos=qos)
+        return Writer(writer, entity.data_type, partial(types.encode, message_type))
 
     def read(self, topic: str, message_type: str, on_sample: OnSample, latched: bool = False) -> None:
         """Deliver a topic's messages from now on, in a thread of this object's.
@@ -382,7 +398,6 @@ def _loopback(domain: int) -> Domain:
 
 CLOCK = "/clock"
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
-_ALIKE_NS = 1_000_000_000  # clocks closer than this are one clock: ROS counts on it between machines
 
 
 class WireClock:
@@ -405,17 +420,9 @@ class WireClock:
         with self._lock:
             return time.time_ns() if self._simulated_ns is None else self._simulated_ns
 
-    def received_ns(self, sample: Sample) -> int:
-        """Receive time of a message [ns].
-
-        That is when it was written, which neither the network nor a busy processor delays, if its writer has our clock:
-        simulation time (as `fgloc play` has it; other players and simulators write by the machine's clock), or the
-        machine's.
-        """
-        now = self.now_ns()
-        apart = abs(sample.source_ns - now)
-        ours = apart <= abs(sample.source_ns - time.time_ns()) if self.simulated else apart < _ALIKE_NS
-        return sample.source_ns if ours else now
+    def received_ns(self, sample: Received) -> int:
+        """Receive time of a message [ns]; see `transport.received_ns`."""
+        return received_ns(sample.source_ns, self.now_ns(), self.simulated)
 
     def _on_clock(self, sample: Sample) -> None:
         stamp = self._messages.decode(CLOCK_TYPE, sample.cdr).clock

@@ -1,0 +1,1 @@
+"""fgloc as a lifecycle node of ROS 2: `settings` and `transport` around `fgloc.live.wire.node`, `node` the node itself."""

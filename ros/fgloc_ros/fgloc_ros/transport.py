@@ -1,0 +1,208 @@
+"""Network of a live run by rclpy: the node's topics, its clock, and messages as rclpy has them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fgloc.live.wire.outputs import Outputs
+from fgloc.live.wire.transport import Publication, received_ns
+from fgloc.recording.reader import TF_TYPES
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rosidl_runtime_py import set_message_fields
+from rosidl_runtime_py.utilities import get_message
+
+_CREATE_S = 0.05  # time between two looks for subscriptions to be made, in the thread of the executor
+_SENT_DEPTH = 20  # messages of a topic that wait for readers
+_READ_DEPTH = 2000  # messages of a topic that wait for the executor: 10 s of it, on a busy machine
+_LARGE_DEPTH = 20  # of large ones: 4 s of images at 5 Hz
+_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_LATCHED_DEPTH = 100
+_DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heard:
+    """One message as rclpy delivers it."""
+
+    topic: str
+    message_type: str
+    message: Any
+    source_ns: int
+    publisher: str = ""  # rclpy does not say who
+
+
+class _NodeClock:
+    """Clock of a node: simulated where ``use_sim_time`` is set."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+
+    def now_ns(self) -> int:
+        return int(self._clock.now().nanoseconds)
+
+    def received_ns(self, message: Any) -> int:
+        return received_ns(message.source_ns, self.now_ns(), bool(self._clock.ros_time_is_active))
+
+
+class _Publisher:
+    """Publisher of one topic."""
+
+    def __init__(self, publisher: Any, message_type: str) -> None:
+        self._publisher = publisher
+        self._type = message_type
+        self._class = get_message(message_type)
+
+    @property
+    def readers(self) -> int:
+        return int(self._publisher.get_subscription_count())
+
+    def publish(self, values: Mapping[str, Any]) -> None:
+        if self._type == _DIAGNOSTICS:  # a byte is bytes in rclpy
+            status = [{**one, "level": bytes([one["level"]])} for one in values["status"]]
+            values = {**values, "status": status}
+        message = self._class()
+        set_message_fields(message, values)
+        self._publisher.publish(message)
+
+
+class RosTransport:
+    """`fgloc.live.wire.transport.Transport` of a lifecycle node. Its publishers stay, its subscriptions end by `stop`."""
+
+    def __init__(self, node: LifecycleNode, map_frame: str, named: Collection[str] = ()) -> None:
+        """Make the publishers.
+
+        Args:
+            node: not yet active.
+            map_frame: transforms from it are of localizers, and no input.
+            named: topics that are used also if they are outside of the node's namespace.
+        """
+        self._node, self._map_frame = node, map_frame
+        self._named = {*named, self.full_name("/tf"), self.full_name("/tf_static")}
+        self._publishers: dict[str, tuple[Any, _Publisher]] = {}
+        self._wanted: list[tuple[str, str, Callable[[Any], None], bool]] = []
+        self._subscriptions: list[Any] = []
+        self._ending: list[Any] = []
+        self._lock = threading.Lock()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulation time stands still
+        self._timer = node.create_timer(_CREATE_S, self._subscribe, clock=steady)
+        for topic, kind in Outputs.TYPES.items():
+            self.writer(self.full_name(topic), kind, topic in Outputs.LATCHED)
+
+    def stop(self) -> None:
+        """End the subscriptions; call it in the executor's thread."""
+        self.forget()
+        self._end()
+
+    def _end(self) -> None:
+        with self._lock:
+            ending, self._ending = self._ending, []
+        for subscription in ending:
+            self._node.destroy_subscription(subscription)
+
+    def forget(self) -> None:
+        """Let the subscriptions end soon; may be called in any thread."""
+        with self._lock:
+            self._wanted.clear()
+            self._ending, self._subscriptions = [*self._ending, *self._subscriptions], []
+
+    def close(self) -> None:
+        """End everything."""
+        self.stop()
+        self._node.destroy_timer(self._timer)
+        for publisher, _ in self._publishers.values():
+            self._node.destroy_lifecycle_publisher(publisher)
+        self._publishers.clear()
+
+    # --- the transport ---
+
+    def full_name(self, name: str) -> str:
+        """Full name of a topic, after remapping; see `Transport.full_name`."""
+        if name == "~/":
+            return f"{self._node.get_fully_qualified_name()}/"
+        return str(self._node.resolve_topic_name(name))
+
+    def clock(self) -> _NodeClock:
+        """Clock of the node."""
+        return _NodeClock(self._node.get_clock())
+
+    def publications(self) -> tuple[Publication, ...]:
+        """Topics with publishers in the node's namespace, with those that it names, and /tf."""
+        space = self._node.get_namespace().rstrip("/") + "/"
+        own = self.full_name("~/")
+        found = set()
+        for topic, kinds in self._node.get_topic_names_and_types():
+            used = topic.startswith(space) or topic in self._named
+            if used and not topic.startswith(own) and len(kinds) == 1 and self._has_others(topic):
+                found.add(Publication(topic, kinds[0]))
+        return tuple(sorted(found, key=lambda p: (p.topic, p.message_type)))
+
+    def _has_others(self, topic: str) -> bool:
+        return int(self._node.count_publishers(topic)) > (topic in self._publishers)
+
+    def has_volatile(self, topic: str) -> bool:
+        """Whether one of the topic's publishers keeps nothing for late readers."""
+        infos = self._node.get_publishers_info_by_topic(topic)
+        return any(info.qos_profile.durability is DurabilityPolicy.VOLATILE for info in infos)
+
+    def read(self, topic: str, message_type: str, on_message: Callable[[Any], None], latched: bool = False) -> None:
+        """Deliver a topic's messages from now on, in the executor's thread; it also makes the subscription."""
+        with self._lock:
+            self._wanted.append((topic, message_type, on_message, latched))
+
+    def decode(self, heard: Heard) -> Any:
+        """Content of a message; transforms from the map are left out, for they are of localizers, as this is."""
+        message = heard.message
+        if heard.message_type in TF_TYPES:
+            message.transforms = [t for t in message.transforms if t.header.frame_id.lstrip("/") != self._map_frame]
+        return message
+
+    def writer(self, topic: str, message_type: str, latched: bool = False) -> _Publisher:
+        """Publisher of a topic, made once; it publishes while the node is active."""
+        if topic not in self._publishers:
+            made = self._node.create_lifecycle_publisher(
+                get_message(message_type),
+                topic,
+                _profile(1 if latched else _SENT_DEPTH, ReliabilityPolicy.RELIABLE, latched),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+            self._publishers[topic] = made, _Publisher(made, message_type)
+        return self._publishers[topic][1]
+
+    # --- the executor's thread ---
+
+    def _subscribe(self) -> None:
+        self._end()
+        with self._lock:
+            wanted, self._wanted = self._wanted, []
+        for topic, message_type, on_message, latched in wanted:
+            depth = _LARGE_DEPTH if message_type in _LARGE else _LATCHED_DEPTH if latched else _READ_DEPTH
+            reliability = ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT
+            subscription = self._node.create_subscription(
+                get_message(message_type),
+                topic,
+                _delivery(topic, message_type, on_message),
+                _profile(depth, reliability, latched),
+                qos_overriding_options=None if latched else QoSOverridingOptions.with_default_policies(),
+            )
+            with self._lock:
+                self._subscriptions.append(subscription)
+
+
+def _delivery(topic: str, message_type: str, on_message: Callable[[Any], None]) -> Callable[[Any, Any], None]:
+    def deliver(message: Any, info: Mapping[str, int]) -> None:
+        source_ns = info["source_timestamp"] or time.time_ns()  # 0: the middleware does not say
+        on_message(Heard(topic, message_type, message, source_ns))
+
+    return deliver
+
+
+def _profile(depth: int, reliability: ReliabilityPolicy, latched: bool) -> QoSProfile:
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
