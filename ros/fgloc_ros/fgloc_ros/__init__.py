@@ -1,1 +1,1 @@
-"""fgloc as a lifecycle node of ROS 2: `settings` and `transport` around `fgloc.live.wire.node`, `node` the node itself."""
+"""fgloc as a lifecycle node of ROS 2: `settings` and `transport` around `fgloc.live.wire.node`, and the `node`."""

@@ -11,18 +11,18 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import rclpy
-from fgloc.config import role_names
-from fgloc.errors import EstimatorError, FglocError
-from fgloc.live import Live
-from fgloc.live.process import EstimationProcess
-from fgloc.live.wire.node import Node
-from fgloc.sensors.maps import configured_map
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from fgloc.config import role_names
+from fgloc.errors import EstimatorError, FglocError
+from fgloc.live import Live
+from fgloc.live.process import EstimationProcess
+from fgloc.live.wire.node import Node
+from fgloc.sensors.maps import configured_map
 from fgloc_ros.settings import PARAMETERS, Settings, settings
 from fgloc_ros.transport import RosTransport
 

@@ -8,15 +8,16 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fgloc.live.wire.outputs import Outputs
-from fgloc.live.wire.transport import Publication, received_ns
-from fgloc.recording.reader import TF_TYPES
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rosidl_runtime_py import set_message_fields
 from rosidl_runtime_py.utilities import get_message
+
+from fgloc.live.wire.outputs import Outputs
+from fgloc.live.wire.transport import Publication, received_ns
+from fgloc.recording.reader import TF_TYPES
 
 _CREATE_S = 0.05  # time between two looks for subscriptions to be made, in the thread of the executor
 _SENT_DEPTH = 20  # messages of a topic that wait for readers
@@ -73,7 +74,7 @@ class _Publisher:
 
 
 class RosTransport:
-    """`fgloc.live.wire.transport.Transport` of a lifecycle node. Its publishers stay, its subscriptions end by `stop`."""
+    """A `Transport` on a lifecycle node. Its publishers stay, its subscriptions end by `stop`."""
 
     def __init__(self, node: LifecycleNode, map_frame: str, named: Collection[str] = ()) -> None:
         """Make the publishers.
