@@ -6,7 +6,7 @@ those that `CornerDetector` finds, without rendering, at 5 Hz. None has learned 
 measure of the others: ``sim.DRIVE.CASE.MODE.ate_mm`` is the mean distance from the truth, ``.over_differential`` its ratio
 to the differential robot's, ``.nees`` NEES/3, each a mean over the seeds.
 
-Noise of the wheels was chosen on seeds 91 to 93. Finished cells are kept (`benchmarks.installed_runs.kept`).
+Noise of the wheels is that of the simulator's robots; of other seeds only 91 was looked at. Finished cells are kept (`benchmarks.installed_runs.kept`).
 """
 
 # ruff: noqa: E501 (lines of the description)
