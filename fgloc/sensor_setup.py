@@ -290,10 +290,10 @@ def _without_effect(config: Config, section: str, camera: str) -> Iterator[str]:
 
 
 def _need_motion(facts: StreamFacts) -> None:
-    if not {"odometry", "joints", "command", "imu", "image", "sightings"} & base_roles(facts.roles):
+    if not {"odometry", "joints", "command", "imu"} & set(facts.roles):
         raise RecordingError(
-            f"{facts.name}: no odometry, joint states, commands or IMU, and no images or sightings; a run needs one of "
-            f"them. Topics: {facts.topics}"
+            f"{facts.name}: no odometry, joint states or commands, and no IMU; a run needs one of them. Topics: "
+            f"{facts.topics}"
         )
 
 
