@@ -28,7 +28,7 @@ def bags(tmp_path_factory):
 
 def run_before(bags, out):
     """Do in this process what the command would start processes for."""
-    for job in plan_bags(bags, None, lambda bag: Config(), "fgloc smooth a b").jobs:
+    for job in plan_bags(bags, None, lambda bag: config_of({}), "fgloc smooth a b").jobs:
         execute(job, out)
 
 
@@ -82,7 +82,7 @@ def test_files_of_other_settings_do_not_count(bags, tmp_path):
 
 def test_a_lost_robot_among_many_exits_with_3(bags, tmp_path):
     given = [bags / "one" / "bag", bags / "lost" / "bag"]
-    for job in plan_bags(given, None, lambda bag: Config(), "fgloc smooth a b").jobs:
+    for job in plan_bags(given, None, lambda bag: config_of({}), "fgloc smooth a b").jobs:
         execute(job, tmp_path / "out")
     code, stdout, stderr = fgloc("smooth", *given, "--out", tmp_path / "out")
     assert code == 3
