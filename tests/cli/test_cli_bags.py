@@ -8,7 +8,7 @@ from test_cli import FILES, fgloc, refused, write_circle
 
 from fgloc.ablation.jobs import attempts, execute
 from fgloc.ablation.sweep import folder_names, plan_bags
-from fgloc.config import Config, load_config
+from fgloc.config import Config, config_of, load_config
 from fgloc.errors import ConfigError
 
 
