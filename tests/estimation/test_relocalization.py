@@ -44,6 +44,10 @@ class Beacons:
     """Exact ranges and bearings."""
 
     sees_corners = False
+    camera_names = ()
+
+    def camera_name(self, event: RangeBearingEvent) -> str:
+        return ""
 
     def measure(self, event: RangeBearingEvent) -> tuple[PointMeasurement, ...]:
         cov = np.diag([1e-4, 1e-3])
@@ -104,6 +108,10 @@ class Nonsense:
     """Poses of all markers, none of which is where the map has it."""
 
     sees_corners = False
+    camera_names = ()
+
+    def camera_name(self, event: RangeBearingEvent) -> str:
+        return ""
 
     def __init__(self) -> None:
         self._rng = np.random.default_rng(0)
