@@ -1,4 +1,4 @@
-"""What no sensor sends, on every input topic of a live run, and inputs that stop: `python -m benchmarks.live_hostile`.
+"""Impossible messages on every input topic of a live run, and inputs that stop: `python -m benchmarks.live_hostile`.
 
 A robot drives in a circle among beacons (`benchmarks.live_streams`). Between its own messages others come on every
 topic, by the same publisher: invalid text, ±1e300, infinities and NaN, empty and huge arrays, frames of ever new names,

@@ -693,7 +693,7 @@ class Config(SensorSections):
 
     @model_validator(mode="after")
     def _with_topics_of_cameras(self) -> Self:
-        """Tell `recording.topics` of the cameras' topics, by which a recording is read."""
+        """Copy the cameras' topics into `recording.topics`, by which a recording is read."""
         if self.cameras and self.camera != CameraConfig():
             raise ValueError("camera is one camera and cameras are several; give one of the two sections")
         self.__dict__["recording"] = _with_topics(self.recording, self.cameras)

@@ -90,7 +90,9 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
     for name in _seeing(path, config):
         found = _Search(path, map_path, now.of_camera(name), landmark_map)
         found.run()
-        findings += of_camera(found.findings, name)
+        codes = {finding.code for finding in findings}  # of the motion, which every camera's search judges again
+        again = of_camera(found.findings, name)
+        findings += [f for f in again if f.code not in codes or f.text.startswith(f"Camera {name}:")]
         now, landmark_map = now.with_camera(name, found.config), found.landmark_map
     undone = now != config or landmark_map is not None
     if undone and any(finding.severity is Severity.ERROR for finding in findings):
@@ -99,14 +101,14 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
 
 
 def _seeing(path: Path, config: Config) -> tuple[str, ...]:
-    """Names of the cameras that a recording has something of; ("",) where there are not several."""
+    """Names of the cameras that a recording has messages of, else of the first; ("",) where there are not several."""
     if not config.cameras:
         return ("",)
     with open_recording(path, config.recording) as recording:
         roles = recording.roles
-    return tuple(
-        name for name in config.cameras if {camera_role(name, r) for r in ("image", "sightings")} & roles.keys()
-    )
+    names = tuple(config.cameras)
+    seeing = tuple(name for name in names if {camera_role(name, r) for r in ("image", "sightings")} & roles.keys())
+    return seeing or names[:1]
 
 
 def of_camera(findings: Iterable[Finding], name: str) -> list[Finding]:

@@ -221,6 +221,7 @@ class Live(registry.SensorInput):
             landmark_map = configured_map(landmark_map, config)
         learned_motion(config, None)  # refuses a file now, not when the robot drives
         self._config, self._recording = config, config.recording
+        self._beside = config.recording.beside
         self._lock = threading.RLock()  # of the reception: events go on in the order in which they came
         self._reception = Reception(config)
         self._results = _Results(config)
@@ -341,7 +342,7 @@ class Live(registry.SensorInput):
         """Stamp as the configuration corrects it, receive time and topic."""
         received = time.time_ns()
         stamp = received if role in self._recording.received_stamps else int(stamp_ns)
-        given = self._recording.beside.get(role) or self._recording.topics.given(role)
+        given = self._beside.get(role) or self._recording.topics.given(role)
         return stamp + round(self._recording.stamp_offset_s.get(role, 0.0) * 1e9), received, given or role
 
     def _deliver(self, event: Event) -> None:

@@ -105,6 +105,8 @@ class LiveFacts:
             None if expected is None else frozenset(r for r in expected if base_role(r) not in _NOT_BUILT_FROM)
         )
         self._config = config
+        self._beside = config.recording.beside
+        self._beside_of = {topic: role for role, topic in self._beside.items()}
         self._topics: dict[Role, str] = {}  # the first topic of each role; others are not used
         self._transforms: dict[bool, dict[tuple[str, str], list[TransformEvent]]] = {False: {}, True: {}}  # by static
         self._frames: FrameTree | None = None
@@ -127,13 +129,11 @@ class LiveFacts:
 
     def _role_of(self, event: Event) -> Role | None:
         """Role of an event's topic, also of an odometry beside the wheels; None if it needs none."""
-        beside = {topic: role for role, topic in self._config.recording.beside.items()}
-        return beside.get(event.topic) or role_of(event, self._config.recording.topics)
+        return self._beside_of.get(event.topic) or role_of(event, self._config.recording.topics)
 
     def _given(self, role: Role) -> str | None:
         """Topic that the configuration gives a role; "none": it is not to be used."""
-        recording = self._config.recording
-        return "none" if role == ODOMETRIES else recording.beside.get(role) or recording.topics.given(role)
+        return "none" if role == ODOMETRIES else self._beside.get(role) or self._config.recording.topics.given(role)
 
     @property
     def first(self) -> Mapping[type[Event], Event]:
@@ -181,7 +181,7 @@ class LiveFacts:
         """Missing parts of the stream, a phrase each."""
         missing = []
         recording = self._config.recording
-        for role in (*role_names(), *recording.beside, *recording.topics.of_cameras):
+        for role in (*role_names(), *self._beside, *recording.topics.of_cameras):
             if role in self.roles or base_role(role) in _NOT_BUILT_FROM:
                 continue
             if role in self._topics:

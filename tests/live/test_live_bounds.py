@@ -1,4 +1,4 @@
-"""What a live run keeps of its inputs is bounded, whatever names come in."""
+"""A live run's memory is bounded for any names of topics and frames."""
 
 import dataclasses
 import gc
