@@ -112,6 +112,7 @@ def test_example_without_arguments_says_which():
     assert done.stderr.startswith("usage: smooth_and_plot.py [-h] BAG MAP.yaml ROBOT.yaml OUT\n")
 
 
+@pytest.mark.slow
 def test_example_smooths_and_plots(tmp_path):
     done = run_example(*(SAMPLE / name for name in ("bag", "map.yaml", "robot.yaml")), tmp_path / "out")
     assert done.returncode == 0, done.stderr

@@ -143,6 +143,7 @@ def _sweep_in_child(folder, out):
     sweep(jobs_of(folder), out, workers=1)
 
 
+@pytest.mark.slow
 def test_fault_70_killed_sweep_resumes_and_runs_nothing_twice(folder, swept, tmp_path):
     _, undisturbed = swept
     child = multiprocessing.get_context("spawn").Process(target=_sweep_in_child, args=(folder, tmp_path))

@@ -142,6 +142,7 @@ def test_a_run_without_sightings_tells_no_gains(commanded):
         calibrate([commanded], commanded.parent / "map.yaml", config)
 
 
+@pytest.mark.slow
 def test_gains_that_no_robot_has_are_not_written(wheeled):
     config = settings("twist")
     far = config.model_copy(update={"wheels": config.wheels.model_copy(update={"scale_v": 0.4})})

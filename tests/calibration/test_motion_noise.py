@@ -73,6 +73,7 @@ def test_noise_that_is_smaller_is_written_in_part(tmp_path):
     assert 0.4 < of_yaw < 0.8
 
 
+@pytest.mark.slow
 def test_init_writes_it_and_the_covariance_is_right_with_it(tmp_path):
     bag = record(tmp_path, 3.0, 2.0, seed=1)
     first = first_settings(bag)

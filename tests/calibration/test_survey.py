@@ -88,6 +88,7 @@ def test_writing_and_reading_keeps_the_map(found, tmp_path):
         assert np.allclose(again.landmarks[i].rotation, m.rotation, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_several_bags_make_one_map(tmp_path):
     halves = [
         write_world(tmp_path / str(n), World(room(), seed=n, seconds=11.0, start_s=s, start_ns=(n + 1) * 10**18))

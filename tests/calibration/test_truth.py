@@ -56,6 +56,7 @@ def write_tricycle(folder, seconds=80.0, truth=True):
     return folder / "bag"
 
 
+@pytest.mark.slow
 def test_geometry_that_is_far_off_is_found_with_the_place_of_the_body(tmp_path):
     bag = write_tricycle(tmp_path)
     found, listed = calibrate([bag], None, settings(GUESS))

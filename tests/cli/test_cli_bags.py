@@ -69,6 +69,7 @@ def test_many_bags_give_what_each_alone_gives(bags, tmp_path):
         assert (tmp_path / "many" / "two_bag" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_files_of_other_settings_do_not_count(bags, tmp_path):
     noises = {0.05: [], 0.2: []}
     for noise in (0.05, 0.2, 0.05, 0.05):

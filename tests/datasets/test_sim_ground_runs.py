@@ -51,6 +51,7 @@ def test_without_an_imu_markers_tell_the_slope(folder: Path) -> None:
     assert 0.1 < found.nees_over_6 < 3.0
 
 
+@pytest.mark.slow
 def test_failures_are_swept_on_a_ramp(folder: Path, tmp_path: Path) -> None:
     path = folder / "suite.yaml"
     path.write_text(yaml.safe_dump(SUITE))

@@ -191,6 +191,7 @@ def test_what_init_writes_undoes_what_is_broken(tmp_path):
     assert not conventions_of(bag, config_of_file(yaml.safe_load(made.text)))
 
 
+@pytest.mark.slow
 def test_ranges_that_are_said_to_be_depths_and_are_not_are_named(tmp_path):
     bag = record(tmp_path, Broken())
     config = config_of({"landmarks": {"range_along_axis": True}})
@@ -235,6 +236,7 @@ def test_a_twist_that_follows_its_pose_late_is_named(tmp_path):
     assert found["odometry.twist_late"].severity is Severity.NOTE  # the pose is used
 
 
+@pytest.mark.slow
 def test_a_map_that_nothing_in_the_recording_sees_is_named_first(tmp_path):
     bag = record(tmp_path, Broken())
     config = config_of({"recording": {"topics": {"imu": "none", "sightings": "none"}}})

@@ -277,6 +277,7 @@ def test_info_names_the_mistake_first(looked, tmp_path):
     assert shown.exit_code == EXIT_LOST
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bag", "of"), [("installed_run", "first_run"), ("first_run", "installed_run")])
 def test_info_names_the_map_of_another_place(bag, of):
     arguments = ["--map", str(SAMPLES / of / "map.yaml"), "--config", str(SAMPLES / bag / "robot.yaml")]

@@ -363,6 +363,7 @@ def test_an_imu_beside_a_sensor_of_position_or_way_is_enough(tmp_path, topics):
     assert "motion.unmeasured" not in [finding.code for finding in result.findings]
 
 
+@pytest.mark.slow
 def test_twenty_hours_at_a_low_rate(tmp_path):
     config = Config.model_validate({"keyframes": {"max_interval_s": 60.0}, "wheels": {"hold_s": 60.0}})
     result = run(bag(tmp_path, n=1200, hz=1.0 / 60.0, topics=("odometry",)), None, config, "online")

@@ -129,12 +129,12 @@ def half_the_size(landmark):
 @pytest.mark.parametrize(
     ("change", "code", "value"),
     [
-        (in_feet, "map.unit", 0.3048),
+        pytest.param(in_feet, "map.unit", 0.3048, marks=pytest.mark.slow),
         (all_in_feet, "map.unit", 0.3048),
-        (in_centimetres, "map.unit", 0.01),
-        (w_first, "map.quaternions", None),
+        pytest.param(in_centimetres, "map.unit", 0.01, marks=pytest.mark.slow),
+        pytest.param(w_first, "map.quaternions", None, marks=pytest.mark.slow),
         (shifted, "map.ids", 1.0),
-        (half_the_size, "map.size", 2.0),
+        pytest.param(half_the_size, "map.size", 2.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_map_that_images_contradict_is_named_with_its_mistake(tmp_path, config, change, code, value):

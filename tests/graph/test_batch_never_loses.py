@@ -130,7 +130,7 @@ def test_gyro_without_wheels(tmp_path, mode, sightings):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("mapped", [True, False], ids=["map", "no_map"])
+@pytest.mark.parametrize("mapped", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["map", "no_map"])
 def test_two_odometries_an_imu_in_three_dimensions_and_minutes_of_rest(tmp_path, mode, mapped):
     rng = np.random.default_rng(5)
     seconds, rest = 300, (60.0, 240.0)

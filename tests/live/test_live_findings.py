@@ -83,6 +83,7 @@ def test_however_long_the_robot_stood_it_takes_twenty_seconds_of_motion_at_most(
     assert stands_s < (event.stamp_ns - START_NS) * 1e-9 < stands_s + 20.0
 
 
+@pytest.mark.slow
 def test_a_mirrored_sensor_is_named_live():
     with Live(config(), beacons(), roles=("odometry", "sightings")) as live:
         made = [mirrored(event) for event in swerving(seconds=26.0)]

@@ -194,7 +194,9 @@ def read_all(path: Path) -> int | None:
     return count
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap", "mcap chunked", "sqlite3"])
+@pytest.mark.parametrize(
+    "kind", ["ros1", "mcap", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("mcap chunked", "sqlite3"))]
+)
 def test_fault_63_bit_flips_give_one_error_type_or_events(tmp_path, kind):
     path = make_bag(tmp_path, kind)
     data = path.read_bytes()

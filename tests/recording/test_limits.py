@@ -70,6 +70,7 @@ EXPECTED = {
 }
 
 
+@pytest.mark.slow
 def test_hostile_recordings_are_refused_within_bounds(tmp_path):
     """In one process, so that its peak is that of the worst of them."""
     made = {k: p for k, p in make_all(tmp_path / "bags", great=256 << 20).items() if k != "mcap_many_chunks"}

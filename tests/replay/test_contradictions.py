@@ -67,6 +67,7 @@ def test_online_the_prior_holds_and_the_run_says_so(long_wheels, kind):
     assert not beyond(result)
 
 
+@pytest.mark.slow
 def test_a_range_scale_is_found_with_the_sightings_that_were_refused_online(tmp_path):
     (finding,) = contradictions(smoothed(write_mistaken(tmp_path, range_scale=0.92, seconds=SECONDS)))
     assert finding.lines.keys() == {"expert.landmarks.range_scale"}
@@ -86,6 +87,7 @@ def test_wheels_and_gyro_that_disagree_move_no_constant_without_sightings(tmp_pa
     assert not beyond(smoothed(bag, mode, mapped=False))
 
 
+@pytest.mark.slow
 def test_without_a_map_ranges_or_wheels_are_named_together(tmp_path):
     bag = write_mistaken(tmp_path, range_scale=0.75, seconds=SECONDS)
     (finding,) = contradictions(smoothed(bag, mapped=False))

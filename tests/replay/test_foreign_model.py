@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 import fgloc
 from fgloc.config import load_config
 from fgloc.evaluation.metrics import compute_metrics
@@ -26,6 +28,7 @@ def test_a_model_of_another_robot_is_named_and_left_out():
     assert reasons.count("contradicted") > 0.5 * len(reasons)
 
 
+@pytest.mark.slow
 def test_the_robots_own_model_is_used():
     config = load_config(SAMPLE / "robot.yaml")
     result = run(SAMPLE / "bag", SAMPLE / "map.yaml", config, "online")

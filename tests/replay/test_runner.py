@@ -24,6 +24,7 @@ def errors(result: RunResult) -> np.ndarray:
     return np.hypot(*(result.trajectory.poses - truth)[:, :2].T)
 
 
+@pytest.mark.slow
 def test_batch_is_at_least_as_accurate_as_online_over_seeds(tmp_path):
     online, batch = [], []
     for seed in range(4):

@@ -292,7 +292,7 @@ def test_events_get_a_keyframe_of_their_own_if_their_stream_says_so(uwb, keyfram
 # --- Whole runs -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("sensor", "bound_m"), [("uwb", 0.08), ("gnss", 0.03)])
+@pytest.mark.parametrize(("sensor", "bound_m"), [pytest.param("uwb", 0.08, marks=pytest.mark.slow), ("gnss", 0.03)])
 def test_the_pose_is_found_and_held_by_one_sensor_alone(recording, sensor, bound_m):
     """No map, no first pose, no camera."""
     config = only(load_config(recording / "robot.yaml"), [sensor])
