@@ -10,6 +10,10 @@ The bags are those of `benchmarks.field_recordings`, in their owners' units. A r
   whole recording, as the fit that it is compared with was: the largest difference of a parameter from that fit, in our
   sigmas. ``.half.ate_m``: calibrated on the first half, reported on the second. ``.nominal.ate_m``: the guesses.
 
+- ``sim.two_cameras.front_dark.over_none``: simulated robots as installed, with a front and a rear camera, online; ATE where
+  the front one is dark for 60 of 100 s over that where none is, both as means over the seeds. ``.one_dark.over_none``: the same
+  of a robot without the rear camera. ``.update_over_one``: mean time of a step with both over that with the front one alone.
+
 Further rows are those of `benchmarks.drives_radio` (ranges and positions), `benchmarks.drives_odometry` (a second
 odometry) and `benchmarks.drives_sim` (``sim.*``: simulated robots), which say themselves what was chosen on which data.
 
@@ -21,11 +25,13 @@ the noise as it is most likely on bag1 and the first half of bag2.
 # ruff: noqa: E501 (lines of the description)
 from __future__ import annotations
 
+import heapq
 import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +44,12 @@ from fgloc.calibrate import calibrate
 from fgloc.config import Config, config_of
 from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.runner import RunResult, run
-from fgloc.types import FloatArray, Trajectory
+from fgloc.types import Event, FloatArray, Trajectory
+from fgloc_datasets.bag import BagWriter
+from fgloc_datasets.sim.physics import make_scene, simulate
+from fgloc_datasets.sim.record import robot_settings, write_beside
+from fgloc_datasets.sim.scenario import FRONT, REAR, Camera, Installation, Scenario
+from fgloc_datasets.sim.sensors import stamp_ns, streams
 
 MECANUM: dict[str, Any] = {
     "recording": {"topics": {"odometry": "none"}},
@@ -85,6 +96,7 @@ REFIT = {
 
 def measure(quick: bool) -> Iterator[Row]:
     """Rows of all recordings; a quick run leaves out what was calibrated on halves."""
+    yield from _two_cameras(range(1 if quick else 5))
     if not DATA.is_dir():
         yield from not_run(["mecanum.bag2.ate_m", "tricycle.ate_m"], f"no {DATA}; set FGLOC_REAL_DATA")
     else:
@@ -123,6 +135,61 @@ def _tricycle(scratch: Path, quick: bool) -> Iterator[Row]:
     if not quick:
         by_half, _ = calibrate([half(recording, tricycle).bag(scratch / "t_half")], None, config)
         yield Row("tricycle.half.ate_m", ate(second_half(smoothed(bag, by_half))), unit="m")
+
+
+_DARK_S = (25.0, 85.0)
+_SCENARIO = Scenario(
+    name="two_cameras",
+    duration_s=100.0,
+    rear=Camera(position=(-0.10, 0.0, 0.25), rpy_deg=(0.0, 0.0, 180.0)),
+    installation=Installation.as_installed(),
+)
+
+
+def _two_cameras(seeds: range) -> Iterator[Row]:
+    ates: dict[str, list[float]] = {name: [] for name in ("none", "front_dark", "one", "one_dark")}
+    step_ms: dict[str, list[float]] = {name: [] for name in ates}
+    for seed in seeds:
+        with tempfile.TemporaryDirectory() as scratch:
+            bag = _simulated(Path(scratch), seed)
+            for name in ates:
+                result = _seen_by(bag, one=name.startswith("one"), dark=name.endswith("dark"))
+                matched = match_result(result, result.config or Config())
+                assert matched is not None
+                ates[name].append(float(np.sqrt(np.mean(matched.distances**2))))
+                step_ms[name].append(float(np.mean(result.step_ms)))
+    mean = {name: float(np.mean(values)) for name, values in ates.items()}
+    spread, n = float(np.std([d / a for d, a in zip(ates["front_dark"], ates["none"], strict=True)])), len(seeds)
+    yield Row("sim.two_cameras.none.ate_mm", 1e3 * mean["none"], float(1e3 * np.std(ates["none"])), n, "mm")
+    yield Row("sim.two_cameras.front_dark.over_none", mean["front_dark"] / mean["none"], spread, n)
+    yield Row("sim.two_cameras.one_dark.over_none", mean["one_dark"] / mean["none"], n=n)
+    ratios = [two / one for two, one in zip(step_ms["none"], step_ms["one"], strict=True)]
+    yield Row("sim.two_cameras.update_over_one", float(np.mean(ratios)), float(np.std(ratios)), n)
+
+
+def _simulated(folder: Path, seed: int) -> Path:
+    """Bag of a robot with two cameras that send the corners of markers, with map and settings beside it."""
+    scene = make_scene(_SCENARIO, seed)
+    log = simulate(scene)
+    with BagWriter(folder / "bag") as bag:
+        for _, write in heapq.merge(*streams(scene, log, bag, "corners"), key=itemgetter(0)):
+            write()
+    write_beside(folder, scene, _SCENARIO, camera=False)
+    return folder / "bag"
+
+
+def _seen_by(bag: Path, one: bool, dark: bool) -> RunResult:
+    """The run online, by both cameras or the front one alone, which may be dark."""
+    cameras = {name: {"sightings": f"/{name}/corners"} for name in ((FRONT,) if one else (FRONT, REAR))}
+    config = config_of(robot_settings(_SCENARIO) | {"cameras": cameras})
+    start, end = (stamp_ns(at_s) for at_s in _DARK_S)
+
+    def left(events: Iterator[Event]) -> Iterator[Event]:
+        for event in events:
+            if not (dark and event.topic == f"/{FRONT}/corners" and start <= event.received_ns < end):
+                yield event
+
+    return run(bag, bag.parent / "map.yaml", config, "online", check=False, events=left)
 
 
 def named(name: str) -> Recording:

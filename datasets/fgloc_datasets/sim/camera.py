@@ -22,7 +22,7 @@ from fgloc.errors import FglocError
 from fgloc.frames import quaternion_matrix
 from fgloc.types import FloatArray
 from fgloc_datasets.sim.physics import TICK_S, Log, Scene
-from fgloc_datasets.sim.scenario import Camera, LightStep, channel_rng
+from fgloc_datasets.sim.scenario import FRONT, Camera, LightStep, channel_rng
 from fgloc_datasets.sim.scene import camera_rotation, intrinsics, render_size
 
 # --- Images -----------------------------------------------------------------------------------------------------------
@@ -63,15 +63,14 @@ class Frame:
 class Renderer:
     """Renders the scene from the robot's camera, undistorted and oversampled. Close it after use."""
 
-    def __init__(self, scene: Scene) -> None:
-        """Open an off-screen context.
+    def __init__(self, scene: Scene, name: str = FRONT) -> None:
+        """Open an off-screen context for the camera of this name.
 
         Raises:
             RenderError: no OpenGL library, or it cannot render off screen.
         """
-        self._scene, self._data = scene, mujoco.MjData(scene.model)
-        assert scene.scenario.camera is not None
-        self._width, self._height, _ = render_size(scene.scenario.camera)
+        self._scene, self._data, self._name = scene, mujoco.MjData(scene.model), name
+        self._width, self._height, _ = render_size(scene.scenario.cameras[name])
         try:
             self._renderer = mujoco.Renderer(scene.model, self._height, self._width)
         except Exception as error:  # every backend raises its own kind, down to AttributeError
@@ -84,7 +83,7 @@ class Renderer:
         data.qpos[:3], data.qpos[3:7] = position, np.roll(quaternion, 1)
         mujoco.mj_kinematics(self._scene.model, data)
         mujoco.mj_camlight(self._scene.model, data)
-        self._renderer.update_scene(data, "camera")
+        self._renderer.update_scene(data, self._name)
         for camera in self._renderer.scene.camera:
             pixel = (camera.frustum_top - camera.frustum_bottom) / self._height
             camera.frustum_center += shift_px[0] * pixel
@@ -136,20 +135,19 @@ def frames(scene: Scene, log: Log) -> Iterator[Frame]:
         yield Frame(e.stamp_s, e.exposure_s, e.gain, e.light, e.take())
 
 
-def exposures(scene: Scene, log: Log) -> Iterator[Exposure]:
+def exposures(scene: Scene, log: Log, name: str = FRONT) -> Iterator[Exposure]:
     """All exposures of a run, in order; an image is rendered when it is taken, at the latest before the next exposure.
 
     Raises:
         RenderError: no OpenGL.
     """
-    camera = scene.scenario.camera
-    assert camera is not None
-    rng = channel_rng(scene.seed, "camera")
+    camera = scene.scenario.cameras[name]
+    rng = channel_rng(scene.seed, name)
     lens = Lens(camera)
     hidden = occluded(scene)
-    renderer = Renderer(scene)
+    renderer = Renderer(scene, name)
     try:
-        for shot in shots(scene, log):
+        for shot in shots(scene, log, name):
 
             def take(shot: Shot = shot) -> Image:
                 renderer.screen({m for ids, begin, end in hidden if begin <= shot.start_s < end for m in ids})
@@ -172,10 +170,9 @@ class Shot:
     light: float  # 1 is full
 
 
-def shots(scene: Scene, log: Log) -> Iterator[Shot]:
-    """All shots of a run, in order."""
-    camera = scene.scenario.camera
-    assert camera is not None
+def shots(scene: Scene, log: Log, name: str = FRONT) -> Iterator[Shot]:
+    """All shots of a run by one of its cameras, in order."""
+    camera = scene.scenario.cameras[name]
     n = int((log.stamps_s[-1] - _FIRST_FRAME_S - camera.max_exposure_s) * camera.rate_hz) + 1
     wanted = camera.exposure_s  # exposure times gain that the automatic exposure has reached
     for k in range(n):
@@ -256,12 +253,11 @@ _NEAR_M = 0.05
 class CornerDetector:
     """Finds markers in shots, in order."""
 
-    def __init__(self, scene: Scene, log: Log) -> None:
+    def __init__(self, scene: Scene, log: Log, name: str = FRONT) -> None:
         """Take the markers at their true places."""
-        camera = scene.scenario.camera
-        assert camera is not None
+        camera = scene.scenario.cameras[name]
         self._log, self._camera = log, camera
-        self._rng = channel_rng(scene.seed, "corners")
+        self._rng = channel_rng(scene.seed, "corners" if name == FRONT else f"corners of {name}")
         self._hidden = occluded(scene)
         self._markers = {i: (m.corners(), m.rotation[:, 2]) for i, m in scene.landmarks.landmarks.items()}
         self._R_base_cam = camera_rotation(camera)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -17,11 +18,23 @@ from scipy.spatial.transform import Rotation
 from fgloc.files.settings import Settings
 from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.types import FloatArray, Landmark, LandmarkMap
-from fgloc_datasets.sim.scenario import Camera, Installation, Robot, Scenario, Section, Vector2, Vector3, channel_rng
+from fgloc_datasets.sim.scenario import (
+    FRONT,
+    REAR,
+    Camera,
+    Installation,
+    Robot,
+    Scenario,
+    Section,
+    Vector2,
+    Vector3,
+    channel_rng,
+)
 from fgloc_datasets.sim.scene import intrinsics, optical_rotation
 
 INSTALLED = "installed.yaml"
 _WITH_WHEELBASE = ("ackermann", "mecanum")  # skid-steer robots have one that nobody needs
+_OTHER_CAMERA = 1_000_003  # is added to the seed for the draws of the second camera
 
 
 class MountedCamera(Section):
@@ -111,6 +124,7 @@ class Believed(Section):
 
     camera: MountedCamera | None
     wheels: Wheels
+    rear: MountedCamera | None = None
 
 
 class Installed(Section):
@@ -121,6 +135,19 @@ class Installed(Section):
     imu: TrueImu
     map: TrueMap
     believed: Believed
+    rear: TrueCamera | None = None
+
+    def true_camera(self, name: str) -> TrueCamera:
+        """The camera of this name as it is."""
+        found = self.camera if name == FRONT else self.rear
+        assert found is not None
+        return found
+
+    def believed_camera(self, name: str) -> MountedCamera:
+        """The camera of this name as it is written down."""
+        found = self.believed.camera if name == FRONT else self.believed.rear
+        assert found is not None
+        return found
 
 
 def install(scenario: Scenario, seed: int, landmarks: LandmarkMap) -> Installed:
@@ -132,12 +159,12 @@ def install(scenario: Scenario, seed: int, landmarks: LandmarkMap) -> Installed:
         landmarks: where the markers hang.
     """
     errors = scenario.installation or Installation()
-    camera, believed = None, None
-    if scenario.camera is not None:
-        true = _mounted(scenario.camera)
-        offset = _uniform(seed, errors, "camera_time_s")
-        camera = TrueCamera(**true.model_dump(), time_offset_s=offset)
-        believed = true if scenario.installation is None else _misjudged(true, seed, errors)
+    cameras: dict[str, TrueCamera] = {}
+    believed: dict[str, MountedCamera] = {}
+    for name, given in scenario.cameras.items():
+        true, of = _mounted(given), seed if name == FRONT else seed + _OTHER_CAMERA
+        cameras[name] = TrueCamera(**true.model_dump(), time_offset_s=_uniform(of, errors, "camera_time_s"))
+        believed[name] = true if scenario.installation is None else _misjudged(true, of, errors)
     robot = scenario.robot
     imu = TrueImu(
         rpy=_triple(np.radians(_normal(seed, errors, "imu_angle_deg", 3))),
@@ -145,12 +172,12 @@ def install(scenario: Scenario, seed: int, landmarks: LandmarkMap) -> Installed:
         time_offset_s=_uniform(seed, errors, "imu_time_s"),
     )
     return Installed(
-        camera=camera,
+        camera=cameras.get(FRONT),
         wheels=_true_wheels(robot, seed, errors),
         imu=imu,
         map=TrueMap(landmarks=tuple(_marker(landmark) for landmark in landmarks.landmarks.values())),
         believed=Believed(
-            camera=believed,
+            camera=believed.get(FRONT),
             wheels=Wheels(
                 left_radius=robot.radius_m,
                 right_radius=robot.radius_m,
@@ -158,7 +185,9 @@ def install(scenario: Scenario, seed: int, landmarks: LandmarkMap) -> Installed:
                 wheelbase=robot.wheelbase_m if robot.kind in _WITH_WHEELBASE else None,
                 steering=Steering() if robot.kind == "ackermann" else None,
             ),
+            rear=believed.get(REAR),
         ),
+        rear=cameras.get(REAR),
     )
 
 
@@ -200,7 +229,8 @@ def camera_jitter_s(installation: Installation | None, seed: int, n: int) -> Flo
 def write_installed(installed: Installed, path: Path) -> None:
     """Write ``installed.yaml``."""
     note = "# The truth of the installation, for evaluation only: no program that localises reads it.\n"
-    content = installed.model_dump(mode="json")
+    unused: Any = {"rear": True, "believed": {"rear"}} if installed.rear is None else None
+    content = installed.model_dump(mode="json", exclude=unused)
     for told in (content["wheels"], content["believed"]["wheels"]):
         for name in ("wheelbase", "steering"):
             if told[name] is None:  # the robot has none

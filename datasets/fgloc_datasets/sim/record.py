@@ -109,7 +109,7 @@ def _unused(scenario: Scenario) -> dict[str, Any]:
             *(set() if steers else {"steering_zero_deg", "steering_share"}),
             *(set() if has_wheelbase else {"wheelbase_share"}),
         },
-        **{name: True for name in ("uwb", "gnss") if getattr(scenario, name) is None},
+        **{name: True for name in ("uwb", "gnss", "rear") if getattr(scenario, name) is None},
         "world": {
             "floor": {name for name in ("ramps", "tilt", "rough") if not getattr(floor, name)},
             "markers": {name for name in ("placed",) if not getattr(markers, name)},
@@ -143,6 +143,8 @@ def robot_settings(scenario: Scenario) -> dict[str, Any]:
     settings: dict[str, Any] = {"recording": {"topics": topics}, "wheels": wheels, "markers": markers}
     if scenario.world.floor.uneven:
         settings["estimator"] = {"ground": "uneven"}
+    if scenario.rear is not None:
+        settings["cameras"] = {name: {"image": f"/{name}/image/compressed"} for name in scenario.cameras}
     if scenario.uwb is not None:
         settings["uwb"] = uwb_settings(scenario, scenario.uwb)
     if scenario.gnss is not None:

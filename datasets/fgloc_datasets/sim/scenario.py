@@ -25,6 +25,8 @@ from fgloc.types import FloatArray
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
+FRONT, REAR = "camera", "rear"
+"""Names of the cameras."""
 
 
 class Section(BaseModel):
@@ -443,9 +445,15 @@ class Scenario(Section):
     world: World = World()
     imu: Imu = Imu()
     camera: Camera | None = Camera()
+    rear: Camera | None = None  # a second camera; corners of both are found in the same light
     uwb: Uwb | None = None
     gnss: Gnss | None = None
     rates: Rates = Rates()
     latency: Latency = Latency()
     control: Control = Control()
     installation: NamedInstallation = None  # perfect: all is exactly as written
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """The cameras by the names that their topics and frames begin with."""
+        return {name: c for name, c in ((FRONT, self.camera), (REAR, self.rear)) if c is not None}

@@ -282,9 +282,9 @@ def build_model(scenario: Scenario, ground: Ground, landmarks: LandmarkMap) -> m
     _add(visual, "map", znear=0.005, zfar=10)
     _add(visual, "quality", offsamples=0, shadowsize=0)
     _add(visual, "headlight", ambient=(0.72, 0.72, 0.72), diffuse=(0.0, 0.0, 0.0), specular=(0.0, 0.0, 0.0))
-    if scenario.camera is not None:
-        width, height, _ = render_size(scenario.camera)
-        _add(visual, "global", offwidth=width, offheight=height)
+    if scenario.cameras:
+        sizes = [render_size(camera) for camera in scenario.cameras.values()]
+        _add(visual, "global", offwidth=max(w for w, _, _ in sizes), offheight=max(h for _, h, _ in sizes))
     asset = _add(root, "asset")
     world = _add(root, "worldbody")
     _room(asset, world, scenario, ground)
@@ -376,14 +376,14 @@ def _robot(root: ET.Element, world: ET.Element, scenario: Scenario) -> None:
         friction=(0.1, 0.001, 0.0001),
         **_touches(robot),
     )
-    if scenario.camera is not None:
-        rotation = camera_rotation(scenario.camera)
-        _, render_height, focal = render_size(scenario.camera)
+    for name, camera in scenario.cameras.items():
+        rotation = camera_rotation(camera)
+        _, render_height, focal = render_size(camera)
         _add(
             base,
             "camera",
-            name="camera",
-            pos=scenario.camera.position,
+            name=name,
+            pos=camera.position,
             xyaxes=(*rotation[:, 0], *-rotation[:, 1]),
             fovy=math.degrees(2 * math.atan(0.5 * render_height / focal)),
         )

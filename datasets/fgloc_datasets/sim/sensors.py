@@ -28,7 +28,7 @@ from fgloc_datasets.sim.camera import CornerDetector, Exposure, Shot, exposures,
 from fgloc_datasets.sim.drives import Command, believed, steering_names, twists, wheel_names
 from fgloc_datasets.sim.installed import camera_jitter_s
 from fgloc_datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
-from fgloc_datasets.sim.scenario import Gnss, Robot, Scenario, Uwb, channel_rng
+from fgloc_datasets.sim.scenario import FRONT, Gnss, Robot, Scenario, Uwb, channel_rng
 
 # --- Rows -------------------------------------------------------------------------------------------------------------
 
@@ -297,7 +297,8 @@ def streams(scene: Scene, log: Log, bag: BagWriter, camera: Sees) -> list[Iterat
     if scene.scenario.gnss is not None:
         channels.append(_fixes(scene, scene.scenario.gnss, log, bag))
     if camera != "nothing" and scene.scenario.camera is not None:
-        channels += [_mounting(scene, bag), (_images if camera == "images" else _corners)(scene, log, bag)]
+        send = _images if camera == "images" else _corners
+        channels += [_mounting(scene, bag), *(send(scene, log, bag, name) for name in scene.scenario.cameras)]
     return channels
 
 
@@ -461,10 +462,9 @@ def _fixes(scene: Scene, gnss: Gnss, log: Log, bag: BagWriter) -> Iterator[Messa
 
 def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
     """Static transforms of camera and IMU, as the installer believes them: the IMU is level."""
-    camera = scene.installed.believed.camera
-    assert camera is not None
+    cameras = {name: scene.installed.believed_camera(name) for name in scene.scenario.cameras}
     mounted = {
-        "camera_optical": (camera.position, Rotation.from_matrix(camera.rotation).as_quat()),
+        **{f"{name}_optical": (c.position, Rotation.from_matrix(c.rotation).as_quat()) for name, c in cameras.items()},
         "imu_link": (scene.scenario.imu.position, np.array([0.0, 0.0, 0.0, 1.0])),
     }
     for frame, (position, quaternion) in mounted.items():
@@ -474,46 +474,46 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
         )
 
 
-def _images(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
+def _images(scene: Scene, log: Log, bag: BagWriter, name: str) -> Iterator[Message]:
     """Messages of images, each with the believed calibration of the camera."""
-    camera = scene.scenario.camera
-    assert camera is not None
+    camera = scene.scenario.cameras[name]
     quality = [cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    arrive = _Arrival(scene, log)
-    for exposure in exposures(scene, log):
+    arrive = _Arrival(scene, log, name)
+    for exposure in exposures(scene, log, name):
         stamp, received = arrive.of(exposure.stamp_s, exposure.exposure_s)
 
         def write(exposure: Exposure = exposure, stamp: int = stamp, received: int = received) -> None:
             data = cv2.imencode(".jpg", exposure.take(), quality)[1].tobytes()
-            bag.compressed_image("/camera/image/compressed", stamp, data, received_ns=received)
+            topic = f"/{name}/image/compressed"
+            bag.compressed_image(topic, stamp, data, received_ns=received, frame_id=f"{name}_optical")
 
-        yield received, partial(_write_lens, scene, bag, stamp, received)
+        yield received, partial(_write_lens, scene, bag, name, stamp, received)
         yield received, write
 
 
-def _corners(scene: Scene, log: Log, bag: BagWriter) -> Iterator[Message]:
+def _corners(scene: Scene, log: Log, bag: BagWriter, name: str) -> Iterator[Message]:
     """Messages of corners that a detector finds without rendering, each with the believed calibration of the camera."""
-    detector, arrive = CornerDetector(scene, log), _Arrival(scene, log)
-    for shot in shots(scene, log):
+    detector, arrive = CornerDetector(scene, log, name), _Arrival(scene, log, name)
+    for shot in shots(scene, log, name):
         stamp, received = arrive.of(shot.start_s + 0.5 * shot.exposure_s, shot.exposure_s)
 
         def write(shot: Shot = shot, stamp: int = stamp, received: int = received) -> None:
-            bag.corners("/camera/corners", stamp, detector.find(shot), received_ns=received)
+            seen, frame = detector.find(shot), f"{name}_optical"
+            bag.corners(f"/{name}/corners", stamp, seen, received_ns=received, frame_id=frame)
 
-        yield received, partial(_write_lens, scene, bag, stamp, received)
+        yield received, partial(_write_lens, scene, bag, name, stamp, received)
         yield received, write
 
 
 class _Arrival:
     """Stamps and receive times of a camera's messages, in order; the clock of the stamps may be late."""
 
-    def __init__(self, scene: Scene, log: Log) -> None:
-        camera, installed = scene.scenario.camera, scene.installed.camera
-        assert camera is not None
-        assert installed is not None
-        self._rng = channel_rng(scene.seed, "latency of camera")
+    def __init__(self, scene: Scene, log: Log, name: str) -> None:
+        camera, late_s = scene.scenario.cameras[name], scene.installed.true_camera(name).time_offset_s
+        self._rng = channel_rng(scene.seed, f"latency of {name}")
         n = round(log.stamps_s[-1] * camera.rate_hz) + 1
-        self._late_s = iter(installed.time_offset_s + camera_jitter_s(scene.scenario.installation, scene.seed, n))
+        seed = scene.seed if name == FRONT else scene.seed + 1
+        self._late_s = iter(late_s + camera_jitter_s(scene.scenario.installation, seed, n))
         self._latency = scene.scenario.latency.camera
         self._stamp = self._received = 0
 
@@ -526,12 +526,10 @@ class _Arrival:
         return self._stamp, self._received
 
 
-def _write_lens(scene: Scene, bag: BagWriter, stamp: int, received: int) -> None:
-    camera, believed = scene.scenario.camera, scene.installed.believed.camera
-    assert camera is not None
-    assert believed is not None
-    size = (camera.width, camera.height)
-    bag.camera_info("/camera/camera_info", stamp, size, believed.matrix, believed.distortion, received_ns=received)
+def _write_lens(scene: Scene, bag: BagWriter, name: str, stamp: int, received: int) -> None:
+    camera, believed = scene.scenario.cameras[name], scene.installed.believed_camera(name)
+    size, topic, frame = (camera.width, camera.height), f"/{name}/camera_info", f"{name}_optical"
+    bag.camera_info(topic, stamp, size, believed.matrix, believed.distortion, received_ns=received, frame_id=frame)
 
 
 def _messages(received: Sequence[int], *write: Callable[[int, int], None]) -> Iterator[Message]:
