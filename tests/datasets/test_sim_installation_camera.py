@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sim_bags import messages
 
-from fgloc.config import MarkersConfig
+from fgloc.config import MarkersConfig, load_config
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, Landmark
@@ -18,6 +18,7 @@ from fgloc_datasets.sim.installed import MountedCamera, load_installed
 from fgloc_datasets.sim.physics import Log, make_scene, simulate
 from fgloc_datasets.sim.record import record
 from fgloc_datasets.sim.scenario import Camera, Control, Installation, Scenario
+from fgloc_datasets.sim.sensors import EPOCH_NS
 
 pytestmark = pytest.mark.render
 
@@ -107,3 +108,26 @@ def test_tf_says_what_is_believed_of_the_mounting(tmp_path: Path) -> None:
     assert 0.0005 < np.linalg.norm(camera.translation - np.array(installed.camera.position)) < 0.015
     np.testing.assert_array_equal(imu.rotation, (0.0, 0.0, 0.0, 1.0))
     assert np.abs(installed.imu.rpy).max() > 0.0
+
+
+def test_a_rear_camera_is_recorded_as_it_is_believed_and_shows_what_is_behind(tmp_path: Path) -> None:
+    rear = Camera(rate_hz=10, position=(-0.1, 0.0, 0.25), rpy_deg=(0.0, 0.0, 180.0))
+    scenario = FULL.model_copy(update={"rear": rear})
+    record(scenario, 3, tmp_path)
+    config = load_config(tmp_path / "robot.yaml")
+    assert list(config.cameras) == ["camera", "rear"]
+    installed = load_installed(tmp_path / "installed.yaml")
+    scene = make_scene(scenario, 3)
+    log, hung = simulate(scene), installed.map.landmark_map()
+    detector = MarkerDetector(scene.landmarks.dictionary, MarkersConfig())
+    sent, seen = messages(tmp_path / "bag"), {}
+    for name in config.cameras:
+        stamp_ns, _, message = sent[f"/{name}/image/compressed"][-1]
+        assert message.header.frame_id == f"{name}_optical"
+        found = detector.find(cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE))
+        seen[name] = {marker_id for marker_id, _ in found}
+        true, at_s = installed.true_camera(name), (stamp_ns - EPOCH_NS) * 1e-9
+        off = [corners - project(true, hung.landmarks[i], log, at_s) for i, corners in found]
+        assert np.abs(np.concatenate(off)).max() < 0.5  # px
+    assert not seen["camera"] & seen["rear"]
+    assert installed.true_camera("rear").position != installed.believed_camera("rear").position
