@@ -17,12 +17,13 @@ from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.info import RecordingInfo, inspect_recording
+from fgloc.recording.info import RecordingInfo, inspect_recording, placing_roles
 from fgloc.recording.reader import Recording, is_derived
 from fgloc.recording.storage import find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
 from fgloc.sensors.base import FirstLook, FirstSection
+from fgloc.sensors.maps import load_map
 from fgloc.types import Event, Finding, SightingsEvent, ordered
 
 _UNCALIBRATED = {
@@ -117,6 +118,8 @@ def first_settings(bag: Path) -> RobotFile:
         "#   model: models/model.safetensors",
     ]
     text = "\n".join(lines) + "\n"
+    for section in seen.sections:
+        text = _with_lines(text, section.others)
     compared = None if seen.info.problems else _compared(bag, text)
     found = () if compared is None else ordered(compared.findings)
     text = with_findings(text, found)
@@ -127,7 +130,9 @@ def first_settings(bag: Path) -> RobotFile:
     elif compared is not None and seen.has_map:  # without a map these constants are not estimated
         text = _with_lines(text, {"wheels": _WHEELS})
     missing += [f.text for f in found if not f.lines]
-    lacking = ("nothing measures", "nothing bounds", "CameraInfo", "calibration is for", "frame", "tf")
+    lacking = ["nothing measures", "CameraInfo", "calibration is for", "frame", "tf"]
+    if not placing_roles(seen.info.roles, config_of_file(yaml.safe_load(text) or {})):
+        lacking.append("nothing bounds")
     missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
     return RobotFile(text, dict(seen.info.roles), tuple(dict.fromkeys(missing)), found)
 
@@ -229,8 +234,13 @@ def _look(bag: Path) -> _Seen:
 
     with Recording(bag, config.recording) as recording:
         info = inspect_recording(recording, config, watch)
-        has_map = find_beside(bag, "map.yaml") is not None
-        look = FirstLook(info.roles, events, recording, has_map)
+        map_path = find_beside(bag, "map.yaml")
+        has_map = map_path is not None
+        try:
+            landmark_map = None if map_path is None else load_map(map_path)
+        except FglocError:  # a run says what is wrong with it
+            landmark_map = None
+        look = FirstLook(info.roles, events, recording, has_map, landmark_map)
         frames = tuple(name for name in BASE_NAMES if name in recording.frames)
         return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted))
 

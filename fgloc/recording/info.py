@@ -378,7 +378,7 @@ def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector]
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
         found.append("No odometry, joint states or commands: nothing measures how the robot moves.")
-    if not unsettled and not _placing(roles, config):
+    if not unsettled and not placing_roles(roles, config):
         found.append("No images and no marker sightings: nothing bounds the drift.")
     images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)
@@ -408,7 +408,7 @@ def unread_map(recording: Recording, config: Config) -> str | None:
         recording: whose roles and topics are known.
         config: of the run.
     """
-    if _placing(recording.roles, config):
+    if placing_roles(recording.roles, config):
         return None
     unread = " ".join(_unused(recording, config))
     return (
@@ -438,7 +438,7 @@ def _lacking(config: Config) -> dict[str, str]:
     }
 
 
-def _placing(roles: Mapping[Role, str], config: Config) -> Collection[str]:
+def placing_roles(roles: Mapping[Role, str], config: Config) -> Collection[str]:
     """Roles that tell where a robot is, of sensors that the configuration has."""
     return base_roles(roles) - _NO_PLACE - _lacking(config).keys()
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, Self
@@ -135,20 +135,29 @@ class FirstLook:
         events: by class, of the classes that the sensor asked for.
         recording: opened.
         has_map: a map lies beside it.
+        landmark_map: that map; None where it cannot be read.
     """
 
     roles: Mapping[str, str]
     events: Mapping[type[Event], Sequence[Event]]
     recording: Any
     has_map: bool
+    landmark_map: LandmarkMap | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class FirstSection:
-    """Lines of a section of ``robot.yaml``, and sentences on values that the recording does not determine."""
+    """Lines of a section of ``robot.yaml``, and sentences on values that the recording does not determine.
+
+    Attributes:
+        lines: of the section, from its head.
+        missing: sentences.
+        others: lines of other sections, by the section's dotted name.
+    """
 
     lines: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,7 +397,7 @@ class Sensor(Protocol):
 
     A sensor whose measurements depend on constants (`PoseMeasurement.constants`) has a property ``parameters`` too: a
     `Parameter` for each, named ``sensor.constant``, with the sigma of its prior about 0; a tuple ``found`` of
-    `FoundRow` brings them into ``metrics.json``.
+    `FoundRow` brings them into ``metrics.json``. ``first_settings`` (`FirstSettings`) is its part of ``fgloc init``.
     """
 
     name: ClassVar[str]

@@ -160,7 +160,8 @@ def motion_parameters(config: Config, sources: Collection[str]) -> tuple[Paramet
 
 def first_settings() -> tuple[FirstSettings, ...]:
     """Contributions of the sensors to the first settings of an unknown robot."""
-    return tuple(sensor.first_settings for sensor in BUILT_IN if sensor.first_settings is not None)
+    found = (getattr(sensor, "first_settings", None) for sensor in (*BUILT_IN, *outside_sensors()))
+    return tuple(settings for settings in found if settings is not None)
 
 
 def detected_kinds() -> tuple[str, ...]:

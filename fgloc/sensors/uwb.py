@@ -33,12 +33,13 @@ from pydantic import Field
 
 from fgloc.config import GateConfig, Section
 from fgloc.errors import ConfigError
-from fgloc.sensors.base import Context, FoundRow, Parameter, Stream, When
+from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, FoundRow, Parameter, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, SensorEvent
 
 _NUMBER = re.compile(r"(\d+)$")
+_FARTHEST_M = 1e3  # that a radio of this kind reaches
 _LEAST_ANCHORS = 3  # that tell a place in the plane
 _AROUND = np.linspace(-math.pi, math.pi, 12, endpoint=False)  # of an anchor: where the search for the first pose begins
 _Metres = Annotated[float, Field(ge=-1e5, le=1e5)]
@@ -160,6 +161,56 @@ class NonLineOfSight(EventFailure):
         return lengthen
 
 
+# --- First settings ---------------------------------------------------------------------------------------------------
+
+_FEWEST = 20  # ranges to one anchor that tell their noise
+_SPAN_S = 2.0  # of three ranges in a row that lie on a line but for noise and the robot's turns
+_FAR = 1.2  # times the longest range but one in a hundred: bound of ranges
+
+
+def _first_section(look: FirstLook) -> FirstSection:
+    """Anchors by the map, where nothing else can see what is in it, noise and bound of the ranges."""
+    events = [e for e in look.events[UwbEvent] if isinstance(e, UwbEvent) and math.isfinite(e.range_m)]
+    if not events:
+        return FirstSection()
+    numbers = sorted({event.anchor for event in events})
+    given = look.landmark_map.landmarks if look.landmark_map is not None else {}
+    seen_otherwise = {role.rpartition("/")[2] for role in look.roles} & {"image", "sightings"}
+    places = {} if seen_otherwise else {i: given[i].position for i in numbers if i in given}
+    shown = ", ".join(map(str, numbers[:12]))
+    if len(places) >= _LEAST_ANCHORS:
+        missing: tuple[str, ...] = ()
+        lines = [
+            "uwb:",
+            "  # Nothing but ranges can see the map of this recording: its landmarks are taken for their anchors.",
+            "  anchors:",
+            *(f"    {i}: [{', '.join(f'{value:g}' for value in place)}]" for i, place in places.items()),
+        ]
+    else:
+        missing = (f"the places of the anchors {shown}, without which ranges are not used (uwb.anchors)",)
+        lines = ["uwb:", f"  # anchors: {{{numbers[0]}: [0.0, 0.0, 2.0]}}  # x y z [m] in the map, of each of {shown}"]
+    lines.append("  # tag: [0.0, 0.0, 0.3]  # antenna in the base frame: x y z [m]")
+    sigma = _noise_m(events)
+    if sigma is not None and sigma > UwbConfig().sigma_m:
+        lines += ["  # By the scatter of ranges that follow one another.", f"  sigma_m: {sigma:.2g}"]
+    far, usual = _FAR * float(np.percentile([event.range_m for event in events], 99.0)), GateConfig().max_range
+    about = f"  # Ranges reach {far / _FAR:.0f} m."
+    others = {"expert.gate": (about, f"  max_range: {math.ceil(far)}")} if usual < far < _FARTHEST_M else {}
+    return FirstSection(tuple(lines), missing, others)
+
+
+def _noise_m(events: Sequence[UwbEvent]) -> float | None:
+    """Standard deviation [m] of a range by its distance from the line through its neighbours; None: too few."""
+    off: list[float] = []
+    for number in {event.anchor for event in events}:
+        own = sorted((e.stamp_ns * 1e-9, e.range_m) for e in events if e.anchor == number)
+        for (t0, r0), (t1, r1), (t2, r2) in zip(own, own[1:], own[2:], strict=False):
+            if t1 - t0 > 0.0 and t2 - t1 > 0.0 and t2 - t0 < _SPAN_S:
+                w = (t1 - t0) / (t2 - t0)
+                off.append((r1 - (1.0 - w) * r0 - w * r2) / math.sqrt(1.0 + w**2 + (1.0 - w) ** 2))
+    return None if len(off) < _FEWEST else 1.4826 * float(np.median(np.abs(off)))
+
+
 # --- The sensor -------------------------------------------------------------------------------------------------------
 
 
@@ -173,6 +224,7 @@ class Uwb:
         Stream("uwb", UwbEvent, {"sensor_msgs/msg/Range": from_range}, ("uwb", "uwb/range"), False, check),
     )
     failures: ClassVar[tuple[type[Section], ...]] = (NonLineOfSight,)
+    first_settings: ClassVar[FirstSettings] = FirstSettings((UwbEvent,), _first_section)
     found: ClassVar[tuple[FoundRow, ...]] = (FoundRow(SCALE, SCALE, 1.0, 1.0), FoundRow(BIAS, BIAS, 0.0, 1.0))
 
     def __init__(self, config: UwbConfig) -> None:
