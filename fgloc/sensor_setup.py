@@ -240,6 +240,9 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     kinds = base_roles(facts.roles)
     T_base_sensor = _sensor_pose(facts, config, notes)
     sensors = _sensors(facts, config, landmark_map)
+    placed = bool(sensors) and all(getattr(sensor, "needs", "") for sensor in sensors)  # by places of their own
+    if placed and {"image", "sightings"}.isdisjoint(kinds):  # a search for the first pose would wait for a landmark
+        landmark_map = None
     if sensors and landmark_map is None:
         landmark_map = _no_landmarks(facts, sensors)
     if landmark_map is None and {"image", "sightings"} & kinds:

@@ -8,6 +8,7 @@ import yaml
 
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import config_of_file
+from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.types import Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
@@ -62,3 +63,12 @@ def test_a_map_with_too_few_of_the_anchors_is_not_of_anchors(tmp_path):
 def test_a_map_that_something_else_sees_is_not_of_anchors(tmp_path):
     made = first_settings(write(tmp_path, sightings=True))
     assert config_of_file(yaml.safe_load(made.text)).uwb.anchors == {}
+
+
+@pytest.mark.slow
+def test_the_first_pose_is_found_beside_the_map_that_only_ranges_can_see(tmp_path):
+    bag = write(tmp_path)
+    config = config_of_file(yaml.safe_load(first_settings(bag).text))
+    result = run(bag, tmp_path / "map.yaml", config, "batch")
+    end = np.array(at((result.trajectory.stamps_ns[-1] - START_NS) * 1e-9)[:2])
+    assert np.linalg.norm(result.trajectory.poses[-1, :2] - end) < 0.5
