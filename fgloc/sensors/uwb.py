@@ -163,7 +163,7 @@ class NonLineOfSight(EventFailure):
 
 # --- First settings ---------------------------------------------------------------------------------------------------
 
-_FEWEST = 20  # ranges to one anchor that tell their noise
+_FEWEST = 20  # ranges with a neighbour on either side that tell the noise
 _SPAN_S = 2.0  # of three ranges in a row that lie on a line but for noise and the robot's turns
 _FAR = 1.2  # times the longest range but one in a hundred: bound of ranges
 
