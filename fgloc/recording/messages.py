@@ -85,9 +85,9 @@ _DEFINITIONS = {
 }
 
 
-def default_typestore(ros1: bool = False) -> Typestore:
-    """Typestore for bags that carry no definitions: ROS 2 Humble (or ROS 1 Noetic) and the marker packages."""
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+def default_typestore(ros1: bool = False, distribution: Stores = Stores.ROS2_HUMBLE) -> Typestore:
+    """Typestore for bags that carry no definitions: a distribution's (or ROS 1 Noetic's) and the marker packages'."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else distribution)
     for name, text in _DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     return store
@@ -301,6 +301,7 @@ def _parse(message_type: str, definition: MessageDefinition) -> Typesdict:
 _HEADER = "std_msgs/msg/Header"
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # ROS 1 types that ROS 2 has, alike, under another name
 _ROS1_NAMES = {ros2: ros1 for ros1, ros2 in _RENAMED.items()}
+_DISTRIBUTIONS = (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_IRON)
 _NUMPY = {"byte": "uint8", "char": "uint8", "bool": "bool"}  # the other element types have numpy's names
 
 
@@ -337,6 +338,22 @@ class Messages:
             store = get_typestore(Stores.EMPTY)
             store.register(definitions)
         return cls(store, ros1)
+
+    @classmethod
+    def of_hash(cls, message_type: str, type_hash: str) -> Messages | None:
+        """Message types of the first distribution whose type has this hash, see `type_hash`; None: no one's has."""
+        for distribution in _DISTRIBUTIONS:
+            messages = cls(default_typestore(distribution=distribution))
+            if messages.type_hash(message_type) == type_hash:
+                return messages
+        return None
+
+    def type_hash(self, message_type: str) -> str:
+        """Hash of a message type as ROS 2 announces it from Iron on (RIHS01, REP 2011); empty: it has none."""
+        try:
+            return str(self._store.hash_rihs01(message_type))
+        except Exception:  # rosbags has no hash of some kinds of fields, and none of unknown types
+            return ""
 
     def layout(self, message_type: str) -> dict[str, tuple[FieldLayout, ...]]:
         """Fields of a message type and of all the types inside it, by type.

@@ -276,3 +276,20 @@ def test_a_topic_that_cannot_be_sent_is_named_and_left_out(tmp_path):
         assert "/wide" in note
         player.play(1000.0)
         assert player.published == 3
+
+
+def test_types_are_told_by_hash_and_read_as_the_publishers_distribution_has_them():
+    """Jazzy's Range has a variance, which Humble's lacks: a reader with Humble's would take it for damaged."""
+    range_type = "sensor_msgs/msg/Range"
+    jazzy = Messages(get_typestore(Stores.ROS2_JAZZY))
+    assert jazzy.type_hash(range_type) != Messages().type_hash(range_type)
+    heard = []
+    with Participant(DOMAIN, messages=jazzy) as one, Participant(DOMAIN) as other:
+        writer = one.writer("/range", range_type)
+        assert wait_until(lambda: other.publications() == (Publication("/range", range_type),))
+        other.read("/range", range_type, heard.append)
+        assert wait_until(lambda: writer.readers == 1)
+        writer.publish({"range": 2.5, "variance": 0.25})
+        assert wait_until(lambda: heard)
+        back = other.decode(heard[0])
+        assert (back.range, back.variance) == (2.5, 0.25)

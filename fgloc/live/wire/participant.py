@@ -5,6 +5,7 @@ cyclonedds is imported late: it comes with the extra ``live``.
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 OWN = "/fgloc/"  # topics below are outputs of `fgloc live`, of this process or another
 _TOPIC = "rt/"
+_TYPE_HASH = re.compile(rb"typehash=(RIHS\d\d_[0-9a-f]{64});")
 
 
 def dds_topic(topic: str) -> str:
@@ -225,6 +227,8 @@ class Participant:
         self._publications: dict[object, Publication] = {}
         self._volatile: set[str] = set()
         self._topics: dict[str, Any] = {}
+        self._hashes: dict[str, str] = {}  # of the type that others write, by topic, where they say it
+        self._types: dict[str, Messages] = {}  # of the topics that are read
         self._readers: list[_Reader] = []
         self._entering: list[_Reader] = []
         self._failure: Exception | None = None
@@ -264,7 +268,7 @@ class Participant:
 
     def decode(self, sample: Sample) -> Any:
         """Content of a message. Raises whatever rosbags leaks on damaged bytes."""
-        return self.messages.decode(sample.message_type, sample.cdr)
+        return self._types.get(sample.topic, self.messages).decode(sample.message_type, sample.cdr)
 
     def publications(self) -> tuple[Publication, ...]:
         """Topics that others publish now, sorted by name.
@@ -285,6 +289,10 @@ class Participant:
                 topic, kind = ros_topic(endpoint.topic_name), ros_type(endpoint.type_name)
                 if topic is not None and kind is not None:
                     self._publications[key] = Publication(topic, kind)
+                    if Policy.Userdata in endpoint.qos and (
+                        said := _TYPE_HASH.search(endpoint.qos[Policy.Userdata].data)
+                    ):
+                        self._hashes[topic] = said[1].decode()
                     if endpoint.qos[Policy.Durability] == Policy.Durability.Volatile:
                         self._volatile.add(topic)
         return tuple(sorted(set(self._publications.values()), key=lambda p: (p.topic, p.message_type)))
@@ -306,6 +314,7 @@ class Participant:
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.DurabilityService(0, Policy.History.KeepLast(_LATCHED_DEPTH), -1, -1, -1),
             Policy.DataRepresentation(use_cdrv0_representation=True),
+            _said_hash(types, message_type),
         )
         writer = DataWriter(self._participant, entity, qos=qos)
         return Writer(writer, entity.data_type, partial(types.encode, message_type))
@@ -320,19 +329,28 @@ class Participant:
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.sub import DataReader
 
-        entity = self._topic(topic, message_type, self.messages)
+        types = self._types[topic] = self._messages_of(topic, message_type)
+        entity = self._topic(topic, message_type, types)
         qos = Qos(
             Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)) if latched else Policy.Reliability.BestEffort,
             Policy.History.KeepLast(_LARGE_DEPTH if message_type in _LARGE else _READ_DEPTH),
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.DataRepresentation(use_cdrv0_representation=True),
             Policy.IgnoreLocal.Participant,  # what we publish is no input
+            _said_hash(types, message_type),
         )
         reader = DataReader(self._participant, entity, qos=qos)
         unread = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
         with self._lock:
             self._entering.append(_Reader(reader, unread, Publication(topic, message_type), on_sample))
         self._changed.set(True)
+
+    def _messages_of(self, topic: str, message_type: str) -> Messages:
+        """Types of the distribution that the topic's publisher says it is of: some differ (Jazzy's Range has a variance)."""
+        said = self._hashes.get(topic, "")
+        if not said or said == self.messages.type_hash(message_type):
+            return self.messages
+        return Messages.of_hash(message_type, said) or self.messages
 
     def _topic(self, topic: str, message_type: str, messages: Messages) -> Any:
         from cyclonedds.core import DDSException
@@ -381,6 +399,13 @@ class Participant:
                 on_sample(sample)
             except Exception as error:  # raised by the next call; the other topics go on
                 self._failure = self._failure or error
+
+
+def _said_hash(messages: Messages, message_type: str) -> Any:
+    """Policy by which an endpoint tells its type's hash, as rmw_cyclonedds and rmw_fastrtps do from Iron on."""
+    from cyclonedds.qos import Policy
+
+    return Policy.Userdata(f"typehash={messages.type_hash(message_type)};".encode())
 
 
 def _loopback(domain: int) -> Domain:
