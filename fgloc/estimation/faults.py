@@ -226,10 +226,12 @@ class FaultAttribution:
             if frame is None:
                 return None
             seen = bool(frame.sightings or frame.rejected)
+            began = steps is not None and k <= newest + 1 - steps
+            if began and not stretch:  # nothing was seen since they differ
+                return None
             if seen or stretch:
                 stretch.append(frame)
             age_s = self._estimator.elapsed_s - frame.elapsed_s
-            began = steps is not None and k <= newest + 1 - steps
             if len(stretch) > 1 and seen and (began or age_s >= self._config.weights.window_s):
                 return stretch[::-1]
             if frame.prior is not None or age_s > self.memory_s:

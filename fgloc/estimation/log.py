@@ -23,6 +23,7 @@ _REASONS = {
     "frozen": "they stood still while the robot moved",
     "left_wheel_dead": "the left wheel's encoder stood still",
     "right_wheel_dead": "the right wheel's encoder stood still",
+    "doubted": "nothing told whether they or the motion model were wrong, and both were doubted",
 }
 _OF_BESIDE = {
     "frozen": "it stood still while the robot moved",

@@ -25,7 +25,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import planar_turn
 from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
-from fgloc.graph.noise import COVARIANCE_FACTOR, FusionRules, NoiseBudget, with_yaw
+from fgloc.graph.noise import COVARIANCE_FACTOR, DOUBTED, FusionRules, NoiseBudget, with_yaw
 from fgloc.sensors.base import Turn
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.learned.sensor import left_out_note
@@ -382,12 +382,15 @@ _MOVED = 0.25  # of the reference source's travel: a wheel that turned less stoo
 _LEAST_M = 0.15
 KNOWN = "distrusted"  # a failure that the configuration states
 CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
+_PROVEN_M = 1.0  # way over which wheels and model have agreed before the model may accuse the wheels
 
 
 class MotionFaultMonitor:
     """Tests wheels against their reference source; known failures are taken as given.
 
-    Where the two differ, wheels are taken to be wrong, unless sightings contradict the learned motion instead.
+    Where the two differ, wheels are taken to be wrong, unless sightings contradict the learned motion instead. Where
+    sightings cannot tell, a model that has not yet agreed with the wheels for longer than it has differed accuses
+    nobody: it is left out, and the wheels are kept with room for a slip.
 
     Attributes:
         flags: how often wheels were flagged, by "source.reason".
@@ -424,6 +427,8 @@ class MotionFaultMonitor:
         self._model_wrong_s = 0.0  # for how long the model is still left out
         self._tested_s = 0.0  # since a model that is left out was last tested
         self._differing_steps = 0  # for how many steps the two have differed
+        self._agreed_m = self._disputed_m = 0.0  # ways over which they agreed, and differed without a judgement
+        self._proven = False  # whether the model was, when they began to differ
 
     def begin(self, step: Step) -> None:
         """Begin the test with the first step of the run, or of a segment."""
@@ -477,6 +482,8 @@ class MotionFaultMonitor:
         by_default = verdict.flagged and (was_left_out or "learned" not in contradicted)
         if "wheels" in contradicted or by_default:
             wrong["wheels"] = self._reason
+        if self._is_dispute(readings, verdict, found is None and not was_left_out):
+            wrong = dict.fromkeys(("wheels", "learned"), DOUBTED)
         before, self._wrong_before = self._wrong_before, wrong
         if verdict.flagged:
             self._count(before.get("wheels"), wrong.get("wheels"), since)
@@ -484,6 +491,19 @@ class MotionFaultMonitor:
         if since or found is None or not news or before.keys() == wrong.keys():
             return wrong, since
         return wrong, found.steps
+
+    def _is_dispute(self, readings: MotionReadings, verdict: GlrResult, undecided: bool) -> bool:
+        """Whether nothing tells which of wheels and model is wrong, where sightings are ``undecided`` between them."""
+        if readings.wheels is None or readings.learned is None or not self._sources.learned_is_independent:
+            return False
+        way = float(np.hypot(*readings.wheels.motion[:2]))
+        if verdict.since:
+            self._proven = self._agreed_m > max(_PROVEN_M, self._disputed_m)
+        if not verdict.flagged:
+            self._agreed_m += way * undecided
+            return False
+        self._disputed_m += way * undecided
+        return undecided and not self._proven and self._reason == "slip"
 
     def _contradicted(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> Contradicted | None:
         """Motion sources that sightings contradict; None: sightings cannot decide, or no decision is due.

@@ -434,6 +434,7 @@ class SightingJudge:
         nearby = PoseWithCovariance(fit.pose, fit.cov)
         row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, nearby, OVERRULED)
         self._rejections["motion.overruled"] += 1
+        self.modes.restart()  # the evidence against landmarks came from a pose that was wrong
         motion = motion.overruled(np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2))
         seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
         return motion, replace(seen, places=(row,))

@@ -112,6 +112,7 @@ def covariance_problem(cov: FloatArray) -> str:
 
 # --- The noise of a step's motion factors -----------------------------------------------------------------------------
 
+DOUBTED = "doubted"  # why wheels and a model that differ are both rejected, where nothing tells which of them is wrong
 _SLIP = 0.1  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
 _REST_PER_SQRT_S = 3e-5  # m/√s, rad/√s of a robot whose wheels and gyro rest: 2 mm in an hour, by its floor and tyres
@@ -214,7 +215,7 @@ class NoiseBudget:
 
         Where they report no motion at all their encoders may have stopped, and the robot may drive as fast as it can.
         """
-        slips = self.rejected[wheels.source] == "slip" and wheels.motion.any()
+        slips = self.rejected[wheels.source] in ("slip", DOUBTED) and wheels.motion.any()
         speed, turn = (_SLIP, _SLIP) if slips else (rules.stopped_speed, rules.stopped_turn)
         seconds = (wheels.stamp_ns - wheels.start_ns) * 1e-9
         speed = max(speed, float(np.hypot(*wheels.motion[:2])) / seconds)

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import fgloc
+from fgloc.ablation.failures import events_of
 from fgloc.config import load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.runner import run
@@ -26,6 +27,49 @@ def test_a_model_of_another_robot_is_named_and_left_out():
     assert metrics.nees_over_3 < 1.4  # with it 358
     reasons = [d.reason for d in result.decisions if d.kind == "learned"]
     assert reasons.count("contradicted") > 0.5 * len(reasons)
+
+
+def dark(first_s, last_s, end_s):
+    """Filter of events: the camera is dark from ``first_s`` to ``last_s`` after the start, and the run ends."""
+
+    def chosen(events):
+        start_ns = None
+        for event in events:
+            start_ns = event.stamp_ns if start_ns is None else start_ns
+            seconds = (event.stamp_ns - start_ns) * 1e-9
+            if seconds > end_s:
+                return
+            if not (isinstance(event, events_of("camera")) and first_s <= seconds < last_s):
+                yield event
+
+    return chosen
+
+
+@pytest.mark.parametrize("gyro", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_model_that_was_never_right_accuses_no_sound_wheels(gyro):
+    """Finding R10: markers are dark before the model could be held against them; wheels and model are both doubted."""
+    config = with_values(load_config(SAMPLE / "robot.yaml"), "motion", {"model": MODEL})
+    config = with_values(config, "gyro", {"use": gyro})
+    result = run(SAMPLE / "bag", SAMPLE / "map.yaml", config, "online", events=dark(1.0, 21.0, 26.0))
+    metrics = compute_metrics(result, result.config)
+    assert metrics.ate_mean_m < 0.06  # without: 1.0 m, with a gyro 0.34 m
+    assert metrics.nees_over_3 < 2.0  # without: 994 and 706
+    reasons = {(d.kind, d.reason) for d in result.decisions}
+    assert ("wheels", "slip") not in reasons
+    assert {("wheels", "doubted"), ("learned", "doubted"), ("learned", "contradicted")} <= reasons
+    assert not {"quarantined", "landmark_moved"} & {reason for _, reason in reasons}
+
+
+@pytest.mark.slow
+def test_no_landmark_is_named_by_a_pose_that_sightings_overrule():
+    """Wheels alone slip on ice: what its only marker says of the robot's wrong place is no evidence against it."""
+    folder = SAMPLES / "patches_run"
+    config = with_values(load_config(folder / "robot.yaml"), "motion", {"model": MODEL})
+    config = with_values(config, "gyro", {"use": False})
+    result = run(folder / "bag", folder / "map.yaml", config, "online", events=dark(2.0, 22.0, 48.0))
+    reasons = [d.reason for d in result.decisions]
+    assert "overruled by sightings" in reasons
+    assert "landmark_moved" not in reasons
 
 
 @pytest.mark.slow

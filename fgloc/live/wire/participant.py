@@ -346,7 +346,7 @@ class Participant:
         self._changed.set(True)
 
     def _messages_of(self, topic: str, message_type: str) -> Messages:
-        """Types of the distribution that the topic's publisher says it is of: some differ (Jazzy's Range has a variance)."""
+        """Types of the distribution that the topic's publisher tells by its type's hash: some differ, as Range does."""
         said = self._hashes.get(topic, "")
         if not said or said == self.messages.type_hash(message_type):
             return self.messages
