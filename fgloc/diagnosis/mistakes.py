@@ -356,7 +356,7 @@ class _Search:
 # --- While a run goes on ----------------------------------------------------------------------------------------------
 
 _FIRST_S, _GROWTH = 20.0, 2.0  # signals of a first comparison, and how many times as much the next one needs
-_FIRST_MOVING_S, _GROWTH_MOVING = 5.0, 1.25  # likewise, of motion: until `_FIRST_S` of it, six more comparisons
+_FIRST_MOVING_S, _GROWTH_MOVING = 5.0, 1.15  # likewise, of motion: until `_FIRST_S` of it, ten more comparisons
 _MOVES_M_S, _MOVES_RAD_S = 0.01, 0.02  # by the wheels: below, the robot stands
 _SCALES = ("sightings.scale", "wheels.scale", "map.unit", "scales", "sightings.range")
 _TURNED_RAD = 0.3  # of a camera: more than the turn by which wheels are off

@@ -382,7 +382,7 @@ _MOVED = 0.25  # of the reference source's travel: a wheel that turned less stoo
 _LEAST_M = 0.15
 KNOWN = "distrusted"  # a failure that the configuration states
 CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
-_PROVEN_M = 1.0  # way over which wheels and model have agreed before the model may accuse the wheels
+_PROVEN_M = 0.5  # way over which wheels and model have agreed before the model may accuse the wheels
 
 
 class MotionFaultMonitor:

@@ -210,8 +210,24 @@ def test_fault_21_a_step_longer_than_what_is_kept_of_the_travel_is_taken_in():
 
 
 def test_without_the_track_no_wheel_is_accused():
-    found = run(trust_in(track=None), 20, sides(0.0, RIGHT))
+    trust = trust_in(track=None)
+    run(trust, 20, sides(LEFT, RIGHT))
+    found = run(trust, 20, sides(0.0, RIGHT), first=20)
     assert found[-1].budget.rejected == {"wheels": "slip"}
+
+
+def test_a_model_that_has_not_agreed_with_the_wheels_accuses_them_no_more_than_itself():
+    """Nothing tells which of them is wrong: the wheels are kept with room for a slip, and only they."""
+    trust = trust_in()
+    found = run(trust, 40, sides(1.4 * LEFT, 1.5 * RIGHT))
+    assert found[-1].budget.rejected == {"wheels": "doubted", "learned": "doubted"}
+    readings = MotionReadings(reading("wheels", 40, SPEED, TURN), learned=reading("learned", 40, SPEED, TURN))
+    (kept,) = found[-1].budget.combine(readings, trust._sources.rules)
+    assert kept.source == "wheels"
+    assert np.sqrt(kept.cov[0, 0]) > 10.0 * np.sqrt(COV[0, 0])
+    # having agreed since for longer than they differed, it may
+    run(trust, 80, sides(LEFT, RIGHT), first=40)
+    assert run(trust, 20, sides(1.4 * LEFT, 1.5 * RIGHT), first=120)[-1].budget.rejected == {"wheels": "slip"}
 
 
 def test_the_gyro_alone_witnesses_a_wrong_turn():
