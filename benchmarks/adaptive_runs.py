@@ -24,7 +24,7 @@ from benchmarks.adaptive_scores import Figures, lost, score
 from fgloc.ablation.failures import AnyFailure, corrupt, generators
 from fgloc.config import Config, config_of
 from fgloc.errors import EstimatorError
-from fgloc.runner import RunResult, run
+from fgloc.runner import RunResult, protections, run
 from fgloc.sensors.failures import Failure, Scene
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
@@ -198,7 +198,12 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
             if estimates:
                 raise
             return None
-    online = replace(result, trajectory=_trajectory(estimates), modes=tuple(e.mode for e in estimates))
+    online = replace(
+        result,
+        trajectory=_trajectory(estimates),
+        modes=tuple(e.mode for e in estimates),
+        protections=protections(estimates),
+    )
     return Replayed(online, result if batch else None, chain, given, steps, landmarks)
 
 

@@ -665,6 +665,18 @@ class LiveConfig(Section):
     )
 
 
+class IntegrityConfig(Section):
+    """The bound on the error of each pose, see docs/integrity.md."""
+
+    risk_per_hour: float = expert(
+        1e-3, ge=1e-9, le=0.5, description="probability that the error exceeds the bound, in an hour of driving"
+    )
+    alert_m: float | None = Field(
+        None, gt=0, le=1e6, description="a bound on the position above this is an alert; None: no alerts"
+    )
+    alert_yaw_rad: float | None = Field(None, gt=0, le=3.2, description="likewise, of the yaw")
+
+
 class TruthConfig(Section):
     """What is known of the truth's frame. Only evaluation reads it."""
 
@@ -689,6 +701,7 @@ class Config(SensorSections):
     weights: WeightsConfig = WeightsConfig()
     batch: BatchConfig = BatchConfig()
     live: LiveConfig = LiveConfig()
+    integrity: IntegrityConfig = IntegrityConfig()
     truth: TruthConfig = TruthConfig()
 
     @model_validator(mode="after")

@@ -14,6 +14,7 @@ from fgloc.types import (
     InstallationFound,
     LandmarkMap,
     Mode,
+    Protection,
     Severity,
     TopicTimes,
     Trajectory,
@@ -41,6 +42,7 @@ class RunData:
     cost: float | None = None  # of the batch: half the sum of squared residuals, refused sightings as the gate's bound
     first_pose_s: float | None = None  # from the first step until a pose was known, as the run went
     config: Config | None = None  # as the run used it: with the mistakes undone
+    protections: tuple[Protection, ...] = ()  # of each pose, online; empty: smoothed
     odometry: Trajectory | None = None  # odometry alone, beside the run; None: nothing measured the motion
 
     @property

@@ -25,7 +25,7 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
 from fgloc.results import RunData
 from fgloc.sensors import registry
-from fgloc.types import Estimate, Finding, FloatArray, Ground, Severity, Trajectory, note, ordered
+from fgloc.types import Estimate, Finding, FloatArray, Ground, Protection, Severity, Trajectory, note, ordered
 
 # --- Results besides poses, and their sentences -------------------------------------------------
 
@@ -205,6 +205,7 @@ def run(
         cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
         config=config,
+        protections=protections(estimates),
         odometry=sane.odometry,
         wall_s=time.perf_counter() - began,
     )
@@ -285,6 +286,13 @@ def last_pass(estimates: list[Estimate]) -> list[Estimate]:
         if not kept or estimate.stamp_ns < kept[-1].stamp_ns:
             kept.append(estimate)
     return kept[::-1]
+
+
+def protections(estimates: Sequence[Estimate]) -> tuple[Protection, ...]:
+    """Bound of each pose; of one that was made up for, nothing is promised."""
+    if all(e.protection is None for e in estimates):
+        return ()
+    return tuple(e.protection or Protection(np.full(3, np.inf), "no fix", alert=True) for e in estimates)
 
 
 def _trajectory(estimates: list[Estimate]) -> Trajectory:

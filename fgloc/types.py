@@ -462,6 +462,26 @@ PLANAR = (0, 1, 5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Protection:
+    """Bound on a pose's error that is exceeded with no more than the configured risk, see docs/integrity.md.
+
+    Attributes:
+        bound: ``(3,)`` along and across the robot [m], and of the yaw [rad].
+        cause: what the bound is due to: "noise", "landmark 7" (displaced), "slip".
+        alert: whether it is above the alert limit.
+    """
+
+    bound: FloatArray
+    cause: str
+    alert: bool = False
+
+    @property
+    def position_m(self) -> float:
+        """Bound on the distance from the true place [m]."""
+        return float(np.hypot(self.bound[0], self.bound[1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """``T_map_base`` at one keyframe. ``cov`` is in the map frame."""
 
@@ -471,6 +491,7 @@ class Estimate:
     mode: Mode = Mode.OK
     decisions: tuple[Decision, ...] = ()
     ground: Ground | None = None  # None: the floor is flat
+    protection: Protection | None = None  # None: not computed (a smoothed pose, or before the first one)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -179,8 +179,9 @@ def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
                 if pose is not None:
                     x, y, yaw = pose.pose
                     sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
-                    stale = "" if node.live is None else node.live.status().stale
-                    text = f"{stale or pose.mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
+                    status = None if node.live is None else node.live.status()
+                    state = pose.mode if status is None else status.stale or status.alert or pose.mode
+                    text = f"{state}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
                     line.update(Text(text), refresh=True)
 
         showing = threading.Thread(target=show, name="fgloc-status-line", daemon=True)

@@ -13,7 +13,7 @@ likelihood ratio approach to the detection and estimation of jumps in linear sys
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,6 +116,26 @@ class LandmarkModes:
     def excludes(self, landmark_id: int) -> bool:
         """Whether sightings of this landmark are not to be used."""
         return landmark_id in self.displacements
+
+    def displaced(self, prior: float) -> Iterator[tuple[int, float, FloatArray, FloatArray]]:
+        """Each landmark in use that may be displaced without having been found out.
+
+        Args:
+            prior: probability that a given landmark is displaced.
+
+        Yields:
+            Its id, the probability that it is displaced, mean ``(3,)`` and variance ``(3,)`` of the error that this
+            makes in the pose, in the base's axes.
+        """
+        evidence = self._evidence.sum(1)
+        M = self._M[:, :3]
+        spread = np.einsum("lij,ljk,lik->li", M, self._cov, M)
+        bias = np.einsum("lij,lj->li", M, self._moved)
+        odds = math.log(prior) - math.log1p(-prior) + 0.5 * np.clip(evidence, -1e3, 1e3)
+        share = 1.0 / (1.0 + np.exp(-odds))
+        for landmark_id, row in self._rows.items():
+            if not self.excludes(landmark_id):
+                yield landmark_id, float(share[row]), bias[row], spread[row]
 
     def sensitivity(self, landmark_id: int) -> FloatArray:
         """Derivative ``(3 + n, 2)`` of the error of pose and installation by a landmark's displacement."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
+from fgloc.estimation.integrity import ProtectionLevels
 from fgloc.estimation.log import JUMP, mode_decisions, place_decision, segment_decision
 from fgloc.estimation.motion import MotionJudge
 from fgloc.estimation.place import InitialPose
@@ -313,6 +314,7 @@ class Recorder:
         self._dead_reckoning_after_s = config.estimator.dead_reckoning_after_s
         self._tracking, self._motion, self._sightings, self._compensation = tracking, motion, sightings, compensation
         self._installation = tracking.installation
+        self._levels = ProtectionLevels(config.integrity, sightings.modes)
         self._last_ground: FloatArray | None = None
         self._clock_jumps: list[Decision] = []  # not yet reported with an estimate
         self._estimator = estimator
@@ -358,7 +360,9 @@ class Recorder:
         if self._frame is not None:
             pose = self._frame.place(frame.k, pose, self._estimator)
             cov = se2.rotate_cov(cov, float(self._frame.T_map_graph[2]))
-        return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground)
+        checked = self._motion.sources.is_checked(frame.readings, frame.budget.rejected)
+        protection = self._levels.of(belief.cov + frame.added_cov, twist, tracking.since_fix_s, checked)
+        return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground, protection)
 
     def _ground_by_clock(self, step: Step, ground: Ground) -> FloatArray:
         """Covariance ``(6, 6)`` of height, roll and pitch for a clock that is off, as `record` has it of x, y, yaw."""

@@ -140,6 +140,11 @@ class MotionSources:
             turns_by_gyro=self._alone is not None and not self._wheels.from_commands,
         )
 
+    def is_checked(self, readings: MotionReadings, rejected: Collection[str]) -> bool:
+        """Whether the wheels of a step were compared with an independent source, and neither was rejected."""
+        others = (self.learned_is_independent and readings.learned is not None) or bool(readings.beside)
+        return readings.wheels is not None and others and not {"wheels", "learned"} & set(rejected)
+
     @property
     def learned_is_independent(self) -> bool:
         """Whether the learned motion can be held against the wheels: it does not read them."""

@@ -16,6 +16,7 @@ from itertools import pairwise
 from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
@@ -332,6 +333,20 @@ class GroundMetrics(BaseModel):
     nees_over_6: float  # of x, y, z, roll, pitch and yaw
 
 
+class ProtectionMetrics(BaseModel):
+    """Bounds on the errors of the poses (docs/integrity.md), and how they held against the truth."""
+
+    model_config = ConfigDict(frozen=True)
+
+    median_m: float  # of the bounds on the position
+    p95_m: float
+    median_yaw_deg: float
+    alert_share: float  # of the poses whose bound is above the alert limit; 0 without a limit
+    causes: dict[str, float]  # shares of the poses, by what their bound is due to
+    exceeded: float | None  # share of the poses that are wrong by more than their bound; None: no truth
+    dangerous: float | None  # likewise, without an alert
+
+
 class OdometryMetrics(BaseModel):
     """Odometry alone against the truth, moved onto it by the rigid motion that fits best: it has no frame."""
 
@@ -358,6 +373,7 @@ class Metrics(BaseModel):
     coverage: dict[str, float] | None  # by number of sigmas: "1", "2", "3"
     ground: GroundMetrics | None  # None: estimated on a flat floor, or no truth
     odometry: OdometryMetrics | None  # None: no truth, or nothing measured the motion
+    protection: ProtectionMetrics | None  # None: a smoothed run
     real_time_factor: float | None  # seconds of recording per second of work
     step_ms: StepTimes | None
     factors: dict[str, int]
@@ -467,6 +483,7 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
         coverage=honest[1],
         ground=against_truth(ground_metrics),
         odometry=None if matched is None else odometry_metrics(result, config, ate_rmse_m(matched)),
+        protection=protection_metrics(result, matched),
         real_time_factor=duration / result.wall_s if result.wall_s > 0 else None,
         step_ms=_step_times(result.step_ms),
         factors=dict(sorted(result.counts.items())),
@@ -490,6 +507,39 @@ def ground_metrics(matched: Matched) -> GroundMetrics | None:
         roll_rmse_deg=math.degrees(_rms(errors[:, 3])),
         pitch_rmse_deg=math.degrees(_rms(errors[:, 4])),
         nees_over_6=float(np.mean(nees(errors, covs))) / 6.0,
+    )
+
+
+def protection_metrics(result: RunData, matched: Matched | None) -> ProtectionMetrics | None:
+    """Figures of the bounds on the errors; None: the run has none."""
+    if not result.protections:
+        return None
+    position = np.array([p.position_m for p in result.protections])
+    yaw, alert = (np.array(values) for values in zip(*((p.bound[2], p.alert) for p in result.protections), strict=True))
+    finite = np.isfinite(position)
+    median, p95 = np.percentile(position[finite], [50, 95]).tolist() if finite.any() else (math.inf, math.inf)
+    causes = Counter(p.cause.split(" ")[0] if finite[i] else "no fix" for i, p in enumerate(result.protections))
+    beyond = None if matched is None else beyond_bounds(result, matched)
+    return ProtectionMetrics(
+        median_m=median,
+        p95_m=p95,
+        median_yaw_deg=math.degrees(float(np.median(yaw))),
+        alert_share=float(alert.mean()),
+        causes={cause: count / len(position) for cause, count in causes.most_common()},
+        exceeded=None if beyond is None else float(beyond[0].mean()),
+        dangerous=None if beyond is None else float((beyond[0] & ~beyond[1]).mean()),
+    )
+
+
+def beyond_bounds(result: RunData, matched: Matched) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Of each matched pose ``(n,)``: whether its error exceeds its bound, and whether there was an alert."""
+    at = np.searchsorted(result.trajectory.stamps_ns, matched.stamps_ns)
+    bounds = np.array([result.protections[i].bound for i in at])
+    errors, yaw = matched.errors, matched.estimate[:, 2]
+    c, s = np.cos(yaw), np.sin(yaw)
+    own = np.column_stack([c * errors[:, 0] + s * errors[:, 1], -s * errors[:, 0] + c * errors[:, 1], errors[:, 2]])
+    return np.asarray((np.abs(own) > bounds).any(axis=1)), np.array(
+        [result.protections[i].alert for i in at], dtype=np.bool_
     )
 
 

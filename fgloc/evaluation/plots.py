@@ -314,8 +314,36 @@ def plot_error(result: RunData, matched: Matched | None) -> Figure:
     return figure
 
 
+def plot_protection(result: RunData, matched: Matched, alert_m: float | None) -> Figure:
+    """Stanford diagram: bound on the position of each pose over its distance from the truth.
+
+    Source: Stanford GPS laboratory; Tossaint et al. 2007, "The Stanford-ESA integrity diagram".
+    """
+    at = np.searchsorted(result.trajectory.stamps_ns, matched.stamps_ns)
+    bound = np.array([result.protections[i].position_m for i in at])
+    known = np.isfinite(bound)
+    error = np.maximum(matched.distances, _LEAST_SHOWN_M)
+    figure = Figure(figsize=(WIDTH, 4.4), dpi=DPI, layout="constrained")
+    axes: Axes = figure.subplots()
+    axes.scatter(error[known], bound[known], s=6.0, color=BLUE, alpha=0.5, lw=0)
+    shown = np.concatenate([error, bound[known]])
+    low, high = 0.5 * float(shown.min()), 2.0 * float(shown.max())
+    axes.fill_between([low, high], [low, low], [low, high], color=RED, alpha=0.12, lw=0)
+    axes.plot([low, high], [low, high], color=GREY, lw=1.0)
+    if alert_m is not None:
+        axes.axhline(alert_m, color=ORANGE, lw=1.0, ls="--")
+        axes.annotate("alert limit", (low, alert_m), fontsize=SMALL, color=ORANGE, va="bottom")
+    axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
+    axes.set_xlabel("distance from the truth [m]", fontsize=NORMAL)
+    axes.set_ylabel("bound on it [m]", fontsize=NORMAL)
+    axes.annotate("wrong by more than the bound", (0.97, 0.04), xycoords="axes fraction", ha="right", fontsize=SMALL)
+    tidy(axes)
+    return figure
+
+
 # --- Timeline: messages received, weights of the sources, fit of the sightings, flags, errors -------------------------
 
+_LEAST_SHOWN_M = 1e-4
 _NOT_SEEN = ("unknown", "place", "prior", "mode", "clock")
 _MAX_FLAGS = 12
 _MAX_LANDMARKS = 20

@@ -25,10 +25,18 @@ from fgloc.config import Config, yaml_of
 from fgloc.evaluation.interactive import interactive
 from fgloc.evaluation.judgements import GRAVITY, Judgement, numbered
 from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
-from fgloc.evaluation.plots import plot_error, plot_height, plot_space, plot_timeline, plot_trajectory
+from fgloc.evaluation.plots import plot_error, plot_height, plot_protection, plot_space, plot_timeline, plot_trajectory
 from fgloc.evaluation.style import FORMATS, Format, image_of, png
 from fgloc.files.atomic import atomic_folder
-from fgloc.files.outputs import write_bytes, write_covariance_csv, write_json, write_steps_csv, write_text, write_tum
+from fgloc.files.outputs import (
+    write_bytes,
+    write_covariance_csv,
+    write_json,
+    write_protection_csv,
+    write_steps_csv,
+    write_text,
+    write_tum,
+)
 from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import true_slips
 from fgloc.results import RunData
@@ -89,6 +97,10 @@ _TIMELINE = (
 _INSTALLATION = (
     "What the run found, and how well; what it cannot determine keeps its value and sigma. A value contradicts the "
     "given one if it is off by more than three sigmas of either. installation.yaml and map.yaml hold all of it."
+)
+_PROTECTION = (
+    "Each pose: the bound that was promised for it over its distance from the truth. Points below the line are wrong "
+    "by more than their bound; without an alert these are dangerous."
 )
 Row = tuple[str, ...]
 
@@ -159,6 +171,7 @@ def _captions(result: RunData, compared: bool) -> Mapping[str, str]:
         "error": "In the map frame. An honest band holds 99.7 % of the errors." if compared else "In the map frame.",
         "timeline": f"{_TIMELINE}{'; the true errors' if compared else ''}.",
         "installation": _INSTALLATION,
+        "protection": _PROTECTION,
         "space": "The path in space; heights are drawn larger than they are.",
         "height": "Height, pitch and roll over the distance travelled, with their 3σ bands.",
     }
@@ -186,6 +199,7 @@ def _figures(metrics: Metrics) -> list[Row]:
         ("NEES / 3", _number(metrics.nees_over_3, 1.0, "{:.3f}"), "1 is honest, more is over-confident"),
         *_ground_figures(metrics),
         ("coverage 1σ / 2σ / 3σ", within, honest),
+        *_protection_figures(metrics),
         ("first pose", _number(metrics.first_pose_s, 1.0, "{:.1f} s"), "after the recording's first step, as it went"),
         ("update", steps, "wall time of one step: median / p95 / p99 / worst"),
         (
@@ -195,6 +209,22 @@ def _figures(metrics: Metrics) -> list[Row]:
         ),
     ]
     return [row for row in rows if row[1] != "–"]
+
+
+def _protection_figures(metrics: Metrics) -> list[Row]:
+    found = metrics.protection
+    if found is None:
+        return []
+    rows: list[Row] = [
+        (
+            "protection level",
+            f"{found.median_m:.3f} / {found.p95_m:.3f} m",
+            "bound on the position's error: median / 95 %",
+        )
+    ]
+    if found.exceeded is not None:
+        rows.append(("beyond the bound", f"{100.0 * found.exceeded:.2f} %", "poses wrong by more than was promised"))
+    return rows
 
 
 def _ground_figures(metrics: Metrics) -> list[Row]:
@@ -256,12 +286,13 @@ def _number(value: float | None, factor: float, form: str) -> str:
 
 # --- The folder -------------------------------------------------------------------------------------------------------
 
-_FIGURES = ("trajectory", "error", "timeline", "space", "height")  # the last two: on uneven ground
+_FIGURES = ("trajectory", "error", "timeline", "protection", "space", "height")  # the last two: on uneven ground
 FILES = (
     "trajectory.tum",
     "truth.tum",
     "covariance.csv",
     "steps.csv",
+    "protection.csv",
     "metrics.json",
     "config.json",
     *(f"{name}.{form}" for name in _FIGURES for form in FORMATS),
@@ -311,6 +342,8 @@ def write_results(
             write_tum(stage / "truth.tum", result.truth)
         write_covariance_csv(stage / "covariance.csv", result.trajectory)
         write_steps_csv(stage / "steps.csv", result.decisions, numbered(result))
+        if result.protections:
+            write_protection_csv(stage / "protection.csv", result.trajectory.stamps_ns, result.protections)
         write_json(stage / "metrics.json", metrics.model_dump())
         write_json(stage / "config.json", provenance)
         for name, data in ({name: images[name] for name in _ALWAYS} | files).items():
@@ -341,6 +374,8 @@ def _drawn(result: RunData, matched: Matched | None, config: Config) -> dict[str
         "error": plot_error(result, matched),
         "timeline": plot_timeline(result, matched, _slips(result, config)),
     }
+    if result.protections and matched is not None:
+        drawn["protection"] = plot_protection(result, matched, config.integrity.alert_m)
     if result.trajectory.ground is not None:
         drawn |= {"space": plot_space(result, matched), "height": plot_height(result, matched)}
     return drawn

@@ -6,7 +6,7 @@ import csv
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from fgloc.errors import OutputError, TrajectoryError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import read_text
 from fgloc.frames import quaternion_matrix, quaternion_yaw, roll_pitch, rpy_matrix, rpy_quaternion
-from fgloc.types import Decision, Trajectory
+from fgloc.types import Decision, IntArray, Protection, Trajectory
 
 _NS = 1_000_000_000
 _TUM_HEADER = "# stamp[s] x[m] y[m] z[m] qx qy qz qw\n"
@@ -138,6 +138,19 @@ def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
         rows.writerow(("stamp", *columns))
         for stamp, cov in zip(trajectory.stamps_ns.tolist(), covs, strict=True):
             rows.writerow((_seconds(stamp), *(f"{value:.9e}" for value in cov[upper])))
+
+
+def write_protection_csv(path: Path, stamps_ns: IntArray, protections: Sequence[Protection]) -> None:
+    """Write the bound on each pose's error: along and across the robot [m], yaw [rad], its cause, and the alert.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_file(path) as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(("stamp", "along_m", "across_m", "yaw_rad", "cause", "alert"))
+        for stamp, p in zip(stamps_ns.tolist(), protections, strict=True):
+            rows.writerow((_seconds(stamp), *(f"{value:.6g}" for value in p.bound), p.cause, int(p.alert)))
 
 
 def write_steps_csv(path: Path, decisions: Iterable[Decision], judged: Mapping[Decision, int] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter, deque
@@ -20,7 +21,7 @@ from fgloc.live.run import MOTION, LiveFacts, OnlineRun, role_name
 from fgloc.live.state import Resumed, fingerprint, read_state, write_state
 from fgloc.sensors.markers.detector import Detector, use_one_thread
 from fgloc.sensors.markers.images import ImageError
-from fgloc.types import Camera, Estimate, Event, Finding, LandmarkMap, Mode, RawEvent, SightingsEvent, Step
+from fgloc.types import Camera, Estimate, Event, Finding, LandmarkMap, Mode, Protection, RawEvent, SightingsEvent, Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,7 @@ class LiveStatus:
     running: bool = False  # its parts are built; before that it waits for what `waiting_for` names
     mode: Mode | None = None  # of the last keyframe; None: no pose yet
     stamp_ns: int | None = None  # of the last keyframe
+    protection: Protection | None = None  # bound on its error
     keyframes: int = 0
     step_ms: float = 0.0  # mean wall time of an update, lately
     step_ms_max: float = 0.0  # longest one so far
@@ -54,6 +56,15 @@ class LiveStatus:
     waiting_for: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()  # what is wrong, one sentence each
     findings: tuple[Finding, ...] = ()  # of sensors, settings and estimate; their sentences are notes too
+
+    @property
+    def alert(self) -> str:
+        """Sentence on a bound above the alert limit; empty: it is below, or there is no limit."""
+        bound = self.protection
+        if bound is None or not bound.alert:
+            return ""
+        yaw = math.degrees(bound.bound[2])
+        return f"ALERT: the pose may be off by {bound.position_m:.2f} m and {yaw:.1f}° ({bound.cause})"
 
     @property
     def stale(self) -> str:
@@ -298,6 +309,7 @@ class Estimation:
                 running=running,
                 mode=None if newest is None else newest.mode,
                 stamp_ns=None if newest is None else newest.stamp_ns,
+                protection=None if newest is None else newest.protection,
                 keyframes=keyframes,
                 step_ms=self._step_s * 1e3,
                 step_ms_max=self._longest_s * 1e3,

@@ -48,6 +48,11 @@ def pose_with_covariance_stamped(
     return {"header": header(stamp_ns, frame), "pose": pose_with_covariance(pose, cov, ground)}
 
 
+def vector_stamped(stamp_ns: int, vector: FloatArray, frame: str) -> Message:
+    """geometry_msgs/Vector3Stamped of three numbers ``(3,)``."""
+    return {"header": header(stamp_ns, frame), "vector": xyz(*vector)}
+
+
 def odometry(
     stamp_ns: int,
     pose: FloatArray,

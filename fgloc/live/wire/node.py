@@ -328,6 +328,7 @@ class Node:
 
     def _on_estimate(self, estimate: Estimate) -> None:
         self._outputs.pose(estimate)
+        self._outputs.protection(estimate)
         self.published["pose"] += 1
 
     def _on_initial_pose(self, given: Received) -> None:
@@ -431,7 +432,9 @@ class Node:
         mode = None if status is None or status.stale else status.mode
         message, values = described(status)
         values |= {f"refused {topic}": str(n) for topic, n in self.refused.items()}
-        wrong = status is not None and any(f.severity is Severity.ERROR for f in status.findings)
+        wrong = status is not None and (
+            bool(status.alert) or any(f.severity is Severity.ERROR for f in status.findings)
+        )
         self._outputs.diagnostics(self._clock.now_ns(), mode, message, values, wrong)
         self.published["diagnostics"] += 1
 
@@ -442,6 +445,10 @@ def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
         return "waiting for the robot's topics", {}
     values = {"keyframes": str(status.keyframes), "update [ms]": f"{status.step_ms:.1f}"}
     values["keyframe delay [s]"] = f"{status.reordering_s:.3f}"
+    if (bound := status.protection) is not None:
+        along, across, yaw = (f"{value:.3f}" for value in bound.bound)
+        values |= {"bound along [m]": along, "bound across [m]": across, "bound of yaw [rad]": yaw}
+        values["bound by"] = bound.cause
     for topic, of in status.topics.items():
         values[f"{of.role} topic"] = topic
         values[f"{of.role} rate [Hz]"] = f"{of.rate_hz:.1f}"
@@ -453,5 +460,5 @@ def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
     if status.stale:
         return status.stale, values
     if status.mode is not None:
-        return str(status.mode), values
+        return status.alert or str(status.mode), values
     return f"waiting for {'; '.join(status.waiting_for)}" if status.waiting_for else "no pose yet", values

@@ -222,6 +222,7 @@ class Outputs:
     TYPES: ClassVar = {
         "~/odometry": "nav_msgs/msg/Odometry",
         "~/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "~/protection": "geometry_msgs/msg/Vector3Stamped",
         "/tf": "tf2_msgs/msg/TFMessage",
         "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
         "~/map": "visualization_msgs/msg/MarkerArray",
@@ -265,6 +266,12 @@ class Outputs:
         e = estimate
         values = standard.pose_with_covariance_stamped(e.stamp_ns, e.pose, e.cov, e.ground, frame=self._frame)
         self._writers["~/pose"].publish(values)
+
+    def protection(self, estimate: Estimate) -> None:
+        """Publish the bound on a keyframe's error: x along and y across the base [m], z of its yaw [rad]."""
+        if estimate.protection is not None:
+            values = standard.vector_stamped(estimate.stamp_ns, estimate.protection.bound, self._frame)
+            self._writers["~/protection"].publish(values)
 
     def transform(self, stamp_ns: int, T_map_child: FloatArray, child_frame: str) -> None:
         """Publish ``T_map_child (3,)`` on /tf."""

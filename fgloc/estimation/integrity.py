@@ -1,0 +1,92 @@
+"""Protection levels: bounds that the error of a pose exceeds with no more than a stated risk, also if a sensor lies.
+
+What may be wrong is a list of hypotheses, each with a prior: nothing but noise; one landmark displaced; a motion source
+wrong since the last fix. Under each the error of the pose has a normal distribution: the landmark modes follow, beside
+the estimator, how a displacement that has not been found out moves the pose and how likely it still is. The bound is
+the least one that keeps the probability of a larger error, over all hypotheses together, within the risk.
+
+Sources: Blanch, Walter, Enge et al. 2015, "Baseline advanced RAIM user algorithm and possible improvements" (a bound
+for each hypothesis from its share of the risk); Pervan, Pullen, Christie 1998, "A multiple hypothesis approach to
+satellite navigation integrity" (posterior probabilities of the hypotheses in place of a test).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fgloc.config import IntegrityConfig
+from fgloc.estimation.landmark_modes import LandmarkModes
+from fgloc.types import FloatArray, Protection
+
+_INDEPENDENT_S = 10.0  # errors further apart than this are taken to be independent: so many samples has an hour
+_NOISE_SHARE = 0.5  # of the risk, for noise alone; the faults share the rest alike
+# Sigma of the errors over that of the covariance, in the tail: models of noise are Gaussian, its tails are not
+_OVERBOUND = 1.3
+_DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and nobody knows
+_SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second of driving ...
+_SLIP_LASTS_S = 1.0  # ... each at most so long, at the speed of the wheels
+_CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
+_LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
+
+
+class ProtectionLevels:
+    """Bounds on the error of each pose, by the hypotheses that the landmark modes follow."""
+
+    def __init__(self, config: IntegrityConfig, modes: LandmarkModes) -> None:
+        """Take the risk and the alert limits, and the hypotheses of displaced landmarks."""
+        self._config, self._modes = config, modes
+        samples = max(3600.0 / _INDEPENDENT_S, 1.0)
+        self._risk = config.risk_per_hour / samples / 3.0  # of a sample and axis
+        self._sigmas = -float(_quantile(np.array(0.5 * _NOISE_SHARE * self._risk)))
+
+    def of(self, cov: FloatArray, speed: FloatArray, since_fix_s: float, checked: bool) -> Protection:
+        """Bound of the newest pose.
+
+        Args:
+            cov: ``(3, 3)`` of the pose in the base's axes, with all that is added to the graph's.
+            speed: ``(3,)`` of the base in its axes [m/s, m/s, rad/s].
+            since_fix_s: time since a sighting was used.
+            checked: whether wheels are compared with an independent source of motion.
+        """
+        variance = _OVERBOUND**2 * np.diag(cov)
+        names: list[str] = []
+        priors, biases, variances = [], [], []
+        for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED):
+            names.append(f"landmark {landmark_id}")
+            priors.append(share)
+            biases.append(np.abs(bias))
+            variances.append(variance + spread)
+        if since_fix_s > 0.0:
+            lasts_s = min(since_fix_s, _SLIP_LASTS_S)
+            linear = float(np.hypot(speed[0], speed[1])) * lasts_s
+            turn = (max(abs(float(speed[2])), _LEAST_RAD_S) if linear > 0.0 else abs(float(speed[2]))) * lasts_s
+            off = np.square([linear, linear, turn]) * (_CHECKED**2 if checked else 1.0)
+            expected = _SLIP_PER_S * since_fix_s
+            names.append("slip")
+            priors.append(-math.expm1(-expected))
+            biases.append(np.zeros(3))
+            variances.append(variance + off * (1.0 + expected))
+        bound, cause = self._sigmas * np.sqrt(variance), "noise"
+        if names:
+            tail = (1.0 - _NOISE_SHARE) * self._risk / len(names) / np.maximum(priors, 1e-300)
+            sigmas = -_quantile(np.minimum(0.5 * tail, 0.5))
+            each = np.array(biases) * (tail < 1.0)[:, None] + sigmas[:, None] * np.sqrt(np.array(variances))
+            worst = int(np.argmax(np.hypot(each[:, 0], each[:, 1])))
+            if np.hypot(*each[worst, :2]) > np.hypot(*bound[:2]):
+                cause = names[worst]
+            bound = np.maximum(bound, each.max(axis=0))
+        return Protection(bound, cause, self._is_alert(bound))
+
+    def _is_alert(self, bound: FloatArray) -> bool:
+        limit, yaw = self._config.alert_m, self._config.alert_yaw_rad
+        beyond = limit is not None and math.hypot(bound[0], bound[1]) > limit
+        return beyond or (yaw is not None and float(bound[2]) > yaw)
+
+
+def _quantile(probability: FloatArray) -> FloatArray:
+    """Standard normal quantile."""
+    from scipy.special import ndtri  # as in `fgloc.stats`
+
+    return np.asarray(ndtri(probability))

@@ -1,0 +1,74 @@
+"""Bounds on the error: they hold the risk, grow with what may be wrong, and say what they are due to."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from fgloc.config import IntegrityConfig
+from fgloc.estimation.integrity import ProtectionLevels
+
+COV = np.diag([0.004, 0.003, 0.005]) ** 2
+REST, DRIVES = np.zeros(3), np.array([0.4, 0.0, 0.1])
+
+
+class Modes:
+    """Hypotheses of displaced landmarks, as `LandmarkModes.displaced` gives them: (id, share, bias, variance)."""
+
+    def __init__(self, *rows):
+        self._rows = rows
+
+    def displaced(self, prior):
+        return iter(self._rows)
+
+
+def bound(modes=None, since_fix_s=0.0, speed=DRIVES, checked=False, **config):
+    levels = ProtectionLevels(IntegrityConfig(**config), modes or Modes())
+    return levels.of(COV, speed, since_fix_s, checked)
+
+
+def displaced(landmark_id, share, bias_m, sigma_m=0.0):
+    return landmark_id, share, np.array([bias_m, 0.0, 0.0]), np.array([sigma_m**2, 0.0, 0.0])
+
+
+def test_noise_alone_exceeds_with_less_than_the_risk():
+    found = bound(risk_per_hour=1e-3)
+    per_sample = 1e-3 / 360.0
+    beyond = [2.0 * norm.sf(b / s) for b, s in zip(found.bound, np.sqrt(np.diag(COV)), strict=True)]
+    assert sum(beyond) < per_sample
+    assert found.cause == "noise"
+    assert (bound(risk_per_hour=1e-5).bound > found.bound).all()
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.05, 0.9])
+def test_the_risk_holds_over_all_hypotheses_together(share):
+    """By numbers: the mixture of all distributions has no more than the risk beyond the bound, along the robot."""
+    modes = Modes(displaced(3, share, 0.05, 0.03), displaced(8, 1e-4, 0.0, 0.4))
+    found = bound(modes, since_fix_s=3.0, risk_per_hour=1e-2)
+    x, sigma = float(found.bound[0]), float(np.sqrt(COV[0, 0]))
+
+    def beyond(mean, spread):
+        return norm.sf((x - mean) / spread) + norm.cdf((-x - mean) / spread)
+
+    total = beyond(0.0, sigma) + share * beyond(0.05, np.hypot(sigma, 0.03)) + 1e-4 * beyond(0.0, np.hypot(sigma, 0.4))
+    assert total < 1e-2 / 360.0
+
+
+def test_a_landmark_that_may_be_displaced_is_named_while_it_matters():
+    assert bound(Modes(displaced(7, 1e-3, 0.0, 0.3))).cause == "landmark 7"
+    assert bound(Modes(displaced(7, 1e-12, 0.0, 0.3))).cause == "noise"
+    assert bound(Modes(displaced(7, 1e-3, 0.0, 1e-5))).cause == "noise"
+
+
+def test_in_the_dark_a_slip_may_go_unseen_and_less_of_it_between_two_sources():
+    fixed, dark, checked = bound(), bound(since_fix_s=5.0), bound(since_fix_s=5.0, checked=True)
+    assert dark.cause == "slip"
+    assert fixed.position_m < checked.position_m < dark.position_m
+    assert bound(since_fix_s=5.0, speed=REST).position_m == fixed.position_m
+
+
+def test_an_alert_is_given_above_the_limit_of_position_or_yaw():
+    position, yaw = bound().position_m, float(bound().bound[2])
+    assert not bound().alert
+    assert bound(alert_m=0.9 * position).alert
+    assert not bound(alert_m=1.1 * position).alert
+    assert bound(alert_m=1.1 * position, alert_yaw_rad=0.9 * yaw).alert
