@@ -44,6 +44,7 @@ KEYS = [
     "coverage",
     "ground",
     "odometry",
+    "protection",
     "real_time_factor",
     "step_ms",
     "factors",
