@@ -175,7 +175,7 @@ class Replay:
         self._image_rejections: Counter[str] = Counter()
         self._image_role = partial(parts.config.recording.topics.role_on, base="image")
         self._first_ns: int | None = None
-        self._first_step_ns: int | None = None
+        self.first_step_ns: int | None = None
         self.first_pose_s: float | None = None
         # a sensor that is not built, as a setting of it is missing, tells no place
         self._seeing = RawEvent | SightingsEvent | SensorEvent if parts.sensors else RawEvent | SightingsEvent
@@ -216,12 +216,12 @@ class Replay:
     def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
         """Note the outcome and the time [ms] of one step."""
         self.step_ms.append(milliseconds)
-        if self._first_step_ns is None:
-            self._first_step_ns = step.stamp_ns
+        if self.first_step_ns is None:
+            self.first_step_ns = step.stamp_ns
         if estimate is None:
             return
         if self.first_pose_s is None:
-            self.first_pose_s = (step.stamp_ns - self._first_step_ns) * 1e-9
+            self.first_pose_s = (step.stamp_ns - self.first_step_ns) * 1e-9
         self.estimates.append(estimate)
         self.decisions.extend(estimate.decisions)
 

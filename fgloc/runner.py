@@ -184,6 +184,7 @@ def run(
         *of_constants,
         *sane.findings,
         *_meaningless(outcome.roles, parts, estimates),
+        *_late(replay, estimates),
     ]
     estimates = sane.simpler or estimates
     return RunResult(
@@ -237,6 +238,25 @@ def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[E
                 "refused: another unit, a geometry that is not filled in, or stamps of another clock.",
                 Severity.ERROR,
             )
+
+
+_LATE_S, _LATE_SHARE = 10.0, 0.3
+
+
+def _late(replay: Replay, estimates: Sequence[Estimate]) -> Iterator[Finding]:
+    """Finding of a run whose place on the map became known late: poses before are missing, or were made afterwards."""
+    at_s = replay.first_pose_s
+    if at_s is None or replay.first_step_ns is None:
+        return
+    whole_s = (estimates[-1].stamp_ns - replay.first_step_ns) * 1e-9
+    if at_s > max(_LATE_S, _LATE_SHARE * whole_s):
+        yield Finding(
+            "place.late",
+            f"The robot's place was known only after {at_s:.0f} of {whole_s:.0f} s, although it was searched from the "
+            "beginning: see which landmarks were seen until then, or give estimator.initial_pose.",
+            Severity.WARNING,
+            value=at_s,
+        )
 
 
 def _contradiction(parts: Assembly) -> Contradiction | None:

@@ -62,6 +62,15 @@ def test_every_keyframe_counts_and_every_factor_is_told(tmp_path):
     assert len(result.step_ms) >= len(result.trajectory)
 
 
+@pytest.mark.parametrize(("blind_s", "named"), [(12.0, True), (4.0, False)])
+def test_a_place_that_is_known_late_is_named_with_the_time(tmp_path, blind_s, named):
+    bag = write_world(tmp_path, World(beacons(), seconds=20.0, blind=((0.0, blind_s),)))
+    result = run(bag, tmp_path / "map.yaml", config(), "online")
+    found = [f for f in result.findings if f.code == "place.late"]
+    assert bool(found) is named
+    assert not named or (found[0].value == pytest.approx(result.first_pose_s) and result.first_pose_s > 12.0)
+
+
 def test_the_truth_is_moved_from_its_body_to_the_base(tmp_path):
     body = (0.12, -0.05, math.radians(87.0))
     bag = write_world(tmp_path, World(beacons(), seconds=6.0), body=body)
