@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections import Counter
@@ -312,7 +313,7 @@ def protections(estimates: Sequence[Estimate]) -> tuple[Protection, ...]:
     """Bound of each pose; of one that was made up for, nothing is promised."""
     if all(e.protection is None for e in estimates):
         return ()
-    return tuple(e.protection or Protection(np.full(3, np.inf), "no fix", alert=True) for e in estimates)
+    return tuple(e.protection or Protection(np.full(3, np.inf), math.inf, "no fix", alert=True) for e in estimates)
 
 
 def _trajectory(estimates: list[Estimate]) -> Trajectory:

@@ -467,18 +467,15 @@ class Protection:
 
     Attributes:
         bound: ``(3,)`` along and across the robot [m], and of the yaw [rad].
+        position_m: on the distance from the true place [m]; less than along and across together.
         cause: what the bound is due to: "noise", "landmark 7" (displaced), "slip".
         alert: whether it is above the alert limit.
     """
 
     bound: FloatArray
+    position_m: float
     cause: str
     alert: bool = False
-
-    @property
-    def position_m(self) -> float:
-        """Bound on the distance from the true place [m]."""
-        return float(np.hypot(self.bound[0], self.bound[1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

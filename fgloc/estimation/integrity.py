@@ -40,6 +40,7 @@ class ProtectionLevels:
         samples = max(3600.0 / _INDEPENDENT_S, 1.0)
         self._risk = config.risk_per_hour / samples / 3.0  # of a sample and axis
         self._sigmas = -float(_quantile(np.array(0.5 * _NOISE_SHARE * self._risk)))
+        self._radii = float(_radius(np.array(2.0 * _NOISE_SHARE * self._risk)))
 
     def of(self, cov: FloatArray, speed: FloatArray, since_fix_s: float, checked: bool) -> Protection:
         """Bound of the newest pose.
@@ -51,38 +52,44 @@ class ProtectionLevels:
             checked: whether wheels are compared with an independent source of motion.
         """
         variance = _OVERBOUND**2 * np.diag(cov)
+        widest = _OVERBOUND**2 * float(np.linalg.eigvalsh(cov[:2, :2])[-1])  # variance in the worst direction
         names: list[str] = []
-        priors, biases, variances = [], [], []
+        priors, biases, added = [], [], []
         for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED):
             names.append(f"landmark {landmark_id}")
             priors.append(share)
             biases.append(np.abs(bias))
-            variances.append(variance + spread)
+            added.append(spread)
         if since_fix_s > 0.0:
             lasts_s = min(since_fix_s, _SLIP_LASTS_S)
             linear = float(np.hypot(speed[0], speed[1])) * lasts_s
             turn = (max(abs(float(speed[2])), _LEAST_RAD_S) if linear > 0.0 else abs(float(speed[2]))) * lasts_s
-            off = np.square([linear, linear, turn]) * (_CHECKED**2 if checked else 1.0)
+            off = np.square([linear, 0.0, turn]) * (_CHECKED**2 if checked else 1.0)
+            off[1] = off[0]
             expected = _SLIP_PER_S * since_fix_s
             names.append("slip")
             priors.append(-math.expm1(-expected))
             biases.append(np.zeros(3))
-            variances.append(variance + off * (1.0 + expected))
+            added.append(off * (1.0 + expected))
         bound, cause = self._sigmas * np.sqrt(variance), "noise"
+        position = self._radii * math.sqrt(widest)
         if names:
+            # An axis has a third of the risk, a position two; no direction is spread by more than the trace
             tail = (1.0 - _NOISE_SHARE) * self._risk / len(names) / np.maximum(priors, 1e-300)
-            sigmas = -_quantile(np.minimum(0.5 * tail, 0.5))
-            each = np.array(biases) * (tail < 1.0)[:, None] + sigmas[:, None] * np.sqrt(np.array(variances))
-            worst = int(np.argmax(np.hypot(each[:, 0], each[:, 1])))
-            if np.hypot(*each[worst, :2]) > np.hypot(*bound[:2]):
-                cause = names[worst]
+            matters = tail < 1.0
+            sigmas, radii = -_quantile(np.minimum(0.5 * tail, 0.5)), _radius(np.minimum(2.0 * tail, 1.0))
+            off_by, spreads = np.array(biases) * matters[:, None], np.array(added)
+            each = off_by + sigmas[:, None] * np.sqrt(variance + spreads)
+            places = np.hypot(off_by[:, 0], off_by[:, 1]) + radii * np.sqrt(widest + spreads[:, :2].sum(axis=1))
+            worst = int(np.argmax(places))
+            if places[worst] > position:
+                position, cause = float(places[worst]), names[worst]
             bound = np.maximum(bound, each.max(axis=0))
-        return Protection(bound, cause, self._is_alert(bound))
+        return Protection(bound, position, cause, self._is_alert(position, float(bound[2])))
 
-    def _is_alert(self, bound: FloatArray) -> bool:
+    def _is_alert(self, position_m: float, yaw_rad: float) -> bool:
         limit, yaw = self._config.alert_m, self._config.alert_yaw_rad
-        beyond = limit is not None and math.hypot(bound[0], bound[1]) > limit
-        return beyond or (yaw is not None and float(bound[2]) > yaw)
+        return (limit is not None and position_m > limit) or (yaw is not None and yaw_rad > yaw)
 
 
 def _quantile(probability: FloatArray) -> FloatArray:
@@ -90,3 +97,8 @@ def _quantile(probability: FloatArray) -> FloatArray:
     from scipy.special import ndtri  # as in `fgloc.stats`
 
     return np.asarray(ndtri(probability))
+
+
+def _radius(probability: FloatArray) -> FloatArray:
+    """Distance that a standard normal vector in the plane exceeds with this probability."""
+    return np.sqrt(-2.0 * np.log(probability))

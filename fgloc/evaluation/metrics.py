@@ -538,7 +538,8 @@ def beyond_bounds(result: RunData, matched: Matched) -> tuple[NDArray[np.bool_],
     errors, yaw = matched.errors, matched.estimate[:, 2]
     c, s = np.cos(yaw), np.sin(yaw)
     own = np.column_stack([c * errors[:, 0] + s * errors[:, 1], -s * errors[:, 0] + c * errors[:, 1], errors[:, 2]])
-    return np.asarray((np.abs(own) > bounds).any(axis=1)), np.array(
+    far = matched.distances > np.array([result.protections[i].position_m for i in at])
+    return np.asarray(far | (np.abs(own) > bounds).any(axis=1)), np.array(
         [result.protections[i].alert for i in at], dtype=np.bool_
     )
 

@@ -141,16 +141,18 @@ def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
 
 
 def write_protection_csv(path: Path, stamps_ns: IntArray, protections: Sequence[Protection]) -> None:
-    """Write the bound on each pose's error: along and across the robot [m], yaw [rad], its cause, and the alert.
+    """Write the bound on each pose's error: along, across [m], yaw [rad] and position [m], its cause, and the alert.
 
     Raises:
         OutputError: the file cannot be written.
     """
     with atomic_file(path) as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(("stamp", "along_m", "across_m", "yaw_rad", "cause", "alert"))
+        rows.writerow(("stamp", "along_m", "across_m", "yaw_rad", "position_m", "cause", "alert"))
         for stamp, p in zip(stamps_ns.tolist(), protections, strict=True):
-            rows.writerow((_seconds(stamp), *(f"{value:.6g}" for value in p.bound), p.cause, int(p.alert)))
+            rows.writerow(
+                (_seconds(stamp), *(f"{value:.6g}" for value in (*p.bound, p.position_m)), p.cause, int(p.alert))
+            )
 
 
 def write_steps_csv(path: Path, decisions: Iterable[Decision], judged: Mapping[Decision, int] | None = None) -> None:

@@ -39,6 +39,13 @@ def test_noise_alone_exceeds_with_less_than_the_risk():
     assert (bound(risk_per_hour=1e-5).bound > found.bound).all()
 
 
+def test_the_bound_on_the_position_holds_for_noise_in_any_direction():
+    found, rng = bound(risk_per_hour=0.5), np.random.default_rng(0)
+    off = rng.multivariate_normal(np.zeros(2), COV[:2, :2], 1_000_000)
+    assert np.mean(np.hypot(*off.T) > found.position_m) < 0.5 / 360.0
+    assert found.position_m < np.hypot(found.bound[0], found.bound[1])
+
+
 @pytest.mark.parametrize("share", [1e-3, 0.05, 0.9])
 def test_the_risk_holds_over_all_hypotheses_together(share):
     """By numbers: the mixture of all distributions has no more than the risk beyond the bound, along the robot."""
