@@ -18,7 +18,7 @@ from fgloc.evaluation import report
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.evaluation.report import plotly
 from fgloc.files.outputs import read_tum
-from fgloc.types import Mode, Trajectory
+from fgloc.types import Mode, Protection, Trajectory
 
 FILES = {
     "trajectory.tum",
@@ -92,7 +92,28 @@ def test_truth_based_metrics_are_null_without_truth(tmp_path):
     report.write_results(figure_eight(truth=False), CONFIG, tmp_path, COMMAND)
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert list(content) == KEYS
-    assert [key for key in KEYS if content[key] is None] == KEYS[3:12]
+    assert [key for key in KEYS if content[key] is None] == KEYS[3:13]
+
+
+def test_bounds_on_the_error_are_written_and_held_against_the_truth(tmp_path):
+    """One pose is wrong by more than its bound, another has no bound at all; both are told."""
+    result = figure_eight()
+    bounds = [Protection(np.array([0.5, 0.5, 0.5]), 0.6, "noise") for _ in range(300)]
+    bounds[5] = Protection(np.array([1e-6, 0.5, 0.5]), 0.6, "landmark 7")
+    bounds[290] = Protection(np.full(3, np.inf), np.inf, "no fix", alert=True)
+    metrics = report.write_results(
+        replace(result, protections=tuple(bounds)), CONFIG, tmp_path, COMMAND, figures=("png",)
+    )
+    assert metrics.protection.exceeded == metrics.protection.dangerous == pytest.approx(1 / 200)
+    assert metrics.protection.alert_share == pytest.approx(1 / 300)
+    assert metrics.protection.causes["landmark"] == pytest.approx(1 / 300)
+    assert metrics.protection.median_m == pytest.approx(0.6)
+    rows = (tmp_path / "protection.csv").read_text().splitlines()
+    assert len(rows) == 301
+    assert rows[6].split(",")[1:] == ["1e-06", "0.5", "0.5", "0.6", "landmark 7", "0"]
+    assert rows[291].endswith(",inf,inf,inf,inf,no fix,1")
+    assert (tmp_path / "protection.png").stat().st_size > 10_000
+    assert "Bounds on the error" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_truth_of_another_time_counts_as_none(tmp_path):

@@ -24,7 +24,7 @@ from fgloc.live.wire.node import described
 from fgloc.recording.standard_messages import diagnostics
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import Finding, Mode, Severity, SightingsEvent, Step
+from fgloc.types import Finding, Mode, Protection, Severity, SightingsEvent, Step
 
 PATIENCE_S = 30.0
 
@@ -140,3 +140,15 @@ def test_an_error_is_in_the_level_of_the_diagnostics_and_in_the_exit_code(severi
     wrong = severity is Severity.ERROR
     levels = [diagnostics(0, Mode.OK, "", {}, w)["status"][0]["level"] for w in (False, wrong)]
     assert (levels[0] != levels[1]) == wrong
+
+
+def test_a_bound_above_the_limit_is_the_message_and_below_it_a_value():
+    bound = Protection(np.array([0.2, 0.1, 0.03]), 0.23, "landmark 7", alert=True)
+    message, values = described(LiveStatus(mode=Mode.OK, protection=bound))
+    assert message.startswith("ALERT: ")
+    assert "0.23 m" in message
+    assert "landmark 7" in message
+    assert (values["bound along [m]"], values["bound by"]) == ("0.200", "landmark 7")
+    calm = LiveStatus(mode=Mode.OK, protection=dataclasses.replace(bound, alert=False))
+    assert described(calm)[0] == "OK"
+    assert calm.alert == ""
