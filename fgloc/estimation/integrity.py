@@ -25,7 +25,7 @@ _NOISE_SHARE = 0.5  # of the risk, for noise alone; the faults share the rest al
 # Sigma of the errors over that of the covariance, in the tail: models of noise are Gaussian, its tails are not
 _OVERBOUND = 1.3
 _DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and nobody knows
-_SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second of driving ...
+_SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second, beside as many as they do show ...
 _SLIP_LASTS_S = 1.0  # ... each at most so long, at the speed of the wheels
 _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
 _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
@@ -42,7 +42,9 @@ class ProtectionLevels:
         self._sigmas = -float(_quantile(np.array(0.5 * _NOISE_SHARE * self._risk)))
         self._radii = float(_radius(np.array(2.0 * _NOISE_SHARE * self._risk)))
 
-    def of(self, cov: FloatArray, speed: FloatArray, since_fix_s: float, checked: bool) -> Protection:
+    def of(
+        self, cov: FloatArray, speed: FloatArray, since_fix_s: float, checked: bool, slips_per_s: float = 0.0
+    ) -> Protection:
         """Bound of the newest pose.
 
         Args:
@@ -50,6 +52,7 @@ class ProtectionLevels:
             speed: ``(3,)`` of the base in its axes [m/s, m/s, rad/s].
             since_fix_s: time since a sighting was used.
             checked: whether wheels are compared with an independent source of motion.
+            slips_per_s: slips that were found in this run: where wheels slip, some slips pass unseen.
         """
         variance = _OVERBOUND**2 * np.diag(cov)
         widest = _OVERBOUND**2 * float(np.linalg.eigvalsh(cov[:2, :2])[-1])  # variance in the worst direction
@@ -66,7 +69,7 @@ class ProtectionLevels:
             turn = (max(abs(float(speed[2])), _LEAST_RAD_S) if linear > 0.0 else abs(float(speed[2]))) * lasts_s
             off = np.square([linear, 0.0, turn]) * (_CHECKED**2 if checked else 1.0)
             off[1] = off[0]
-            expected = _SLIP_PER_S * since_fix_s
+            expected = (_SLIP_PER_S + slips_per_s) * since_fix_s
             names.append("slip")
             priors.append(-math.expm1(-expected))
             biases.append(np.zeros(3))

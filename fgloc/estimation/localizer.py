@@ -361,7 +361,9 @@ class Recorder:
             pose = self._frame.place(frame.k, pose, self._estimator)
             cov = se2.rotate_cov(cov, float(self._frame.T_map_graph[2]))
         checked = self._motion.sources.is_checked(frame.readings, frame.budget.rejected)
-        protection = self._levels.of(belief.cov + frame.added_cov, twist, tracking.since_fix_s, checked)
+        protection = self._levels.of(
+            belief.cov + frame.added_cov, twist, tracking.since_fix_s, checked, self._motion.slips_per_s
+        )
         return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground, protection)
 
     def _ground_by_clock(self, step: Step, ground: Ground) -> FloatArray:

@@ -582,6 +582,7 @@ def _without(readings: MotionReadings, sources: Collection[str]) -> MotionReadin
 
 # --- Judge, and revise past steps -------------------------------------------------------------------------------------
 
+_RATE_MEMORY_S = 60.0  # added to the time of a run, which at its beginning says little of a rate
 _CARRIED = "carried"  # why nothing of a robot that was lifted enters
 
 
@@ -717,6 +718,11 @@ class MotionJudge:
     def record_fix(self) -> None:
         """Note that sightings, or a given pose, have fixed where the robot is."""
         self._lift.fix()
+
+    @property
+    def slips_per_s(self) -> float:
+        """Slips of the wheels that were found in this run, for each second of it."""
+        return self._faults.flags["wheels.slip"] / (_RATE_MEMORY_S + self._estimator.elapsed_s)
 
     @property
     def is_carried(self) -> bool:
