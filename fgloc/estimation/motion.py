@@ -394,8 +394,8 @@ class MotionFaultMonitor:
     """Tests wheels against their reference source; known failures are taken as given.
 
     Where the two differ, wheels are taken to be wrong, unless sightings contradict the learned motion instead. Where
-    sightings cannot tell, a model that has not yet agreed with the wheels for longer than it has differed accuses
-    nobody: it is left out, and the wheels are kept with room for a slip.
+    sightings cannot tell, a model that never agreed with the wheels for longer than it differed, nor with sightings
+    against them, accuses nobody: it is left out, and the wheels are kept with room for a slip.
 
     Attributes:
         flags: how often wheels were flagged, by "source.reason".
@@ -433,7 +433,7 @@ class MotionFaultMonitor:
         self._tested_s = 0.0  # since a model that is left out was last tested
         self._differing_steps = 0  # for how many steps the two have differed
         self._agreed_m = self._disputed_m = 0.0  # ways over which they agreed, and differed without a judgement
-        self._proven = False  # whether the model was, when they began to differ
+        self._proven = False  # whether the model has agreed with the wheels for long, or with sightings against them
 
     def begin(self, step: Step) -> None:
         """Begin the test with the first step of the run, or of a segment."""
@@ -477,9 +477,11 @@ class MotionFaultMonitor:
         contradicted = frozenset() if found is None else found.sources
         if self._attribution is not None and "learned" in contradicted:
             self._model_wrong_s = self._attribution.memory_s  # until it has agreed for as long: it mostly stays wrong
+            self._proven, self._agreed_m, self._disputed_m = False, 0.0, 0.0
             if not was_left_out:
                 self._glr.reset()  # wheels are compared with another source from now on
         elif found is not None:
+            self._proven |= not was_left_out  # they differ, and it is not the model that sightings contradict
             self._model_wrong_s = max(self._model_wrong_s - self._config.window_s, 0.0)
         if verdict.flagged:
             self._reason = self._failure(since)
@@ -501,9 +503,9 @@ class MotionFaultMonitor:
         """Whether nothing tells which of wheels and model is wrong, where sightings are ``undecided`` between them."""
         if readings.wheels is None or readings.learned is None or not self._sources.learned_is_independent:
             return False
-        way = float(np.hypot(*readings.wheels.motion[:2]))
+        way = max(self._sides(readings.wheels.motion))
         if verdict.since:
-            self._proven = self._agreed_m > max(_PROVEN_M, self._disputed_m)
+            self._proven |= self._agreed_m > max(_PROVEN_M, self._disputed_m)
         if not verdict.flagged:
             self._agreed_m += way * undecided
             return False
