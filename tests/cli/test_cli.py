@@ -33,6 +33,7 @@ FILES = {
     "installation.yaml",
     "map.yaml",
 }
+FILES_OF = {"batch": FILES, "smooth": FILES, "online": FILES | {"protection.csv"}}
 
 
 def write_circle(folder, seconds=10.0, sees=True, truth=True):
@@ -78,7 +79,7 @@ def refused(*arguments):
 def test_run_writes_all_results(bag, tmp_path, command):
     code, stdout, stderr = fgloc(command, bag, "--out", tmp_path / "out")
     assert (code, stderr) == (0, "")
-    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES_OF[command]
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["ate_mean_m"] < 0.04
     assert 0.1 < metrics["nees_over_3"] < 3.0
@@ -117,7 +118,7 @@ def test_lost_robot_exits_with_3_after_writing(tmp_path):
     code, _, stderr = fgloc("online", bag, "--out", tmp_path / "out")
     assert code == 3
     assert "LOST for" in stderr
-    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES_OF["online"]
     assert "LOST" in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -249,7 +250,7 @@ def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
     code, stdout, _ = fgloc("demo", "--out", tmp_path / "out")
     assert code == 0
     for mode in ("batch", "online"):
-        assert {file.name for file in (tmp_path / "out" / mode).iterdir()} == FILES
+        assert {file.name for file in (tmp_path / "out" / mode).iterdir()} == FILES_OF[mode]
         assert str(tmp_path / "out" / mode / "report.html") in stdout
 
 
