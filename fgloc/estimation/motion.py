@@ -489,7 +489,10 @@ class MotionFaultMonitor:
         by_default = verdict.flagged and (was_left_out or "learned" not in contradicted)
         if "wheels" in contradicted or by_default:
             wrong["wheels"] = self._reason
-        if self._is_dispute(readings, verdict, found is None and not was_left_out):
+        undecided = found is None and not was_left_out and self._compares_model(readings)
+        if undecided:
+            self._record_agreement(readings, verdict)
+        if undecided and verdict.flagged and not self._proven and self._reason == "slip":
             wrong = dict.fromkeys(("wheels", "learned"), DOUBTED)
         before, self._wrong_before = self._wrong_before, wrong
         if verdict.flagged:
@@ -499,18 +502,20 @@ class MotionFaultMonitor:
             return wrong, since
         return wrong, found.steps
 
-    def _is_dispute(self, readings: MotionReadings, verdict: GlrResult, undecided: bool) -> bool:
-        """Whether nothing tells which of wheels and model is wrong, where sightings are ``undecided`` between them."""
-        if readings.wheels is None or readings.learned is None or not self._sources.learned_is_independent:
-            return False
-        way = max(self._sides(readings.wheels.motion))
+    def _compares_model(self, readings: MotionReadings) -> bool:
+        """Whether the test of this step holds wheels against a model that does not read them."""
+        return self._sources.learned_is_independent and None not in (readings.wheels, readings.learned)
+
+    def _record_agreement(self, readings: MotionReadings, verdict: GlrResult) -> None:
+        """Add the way of a step on which wheels and model agreed, or differed without a sighting that decides."""
+        assert readings.wheels is not None
         if verdict.since:
             self._proven |= self._agreed_m > max(_PROVEN_M, self._disputed_m)
-        if not verdict.flagged:
-            self._agreed_m += way * undecided
-            return False
-        self._disputed_m += way * undecided
-        return undecided and not self._proven and self._reason == "slip"
+        way = max(self._sides(readings.wheels.motion))
+        if verdict.flagged:
+            self._disputed_m += way
+        else:
+            self._agreed_m += way
 
     def _contradicted(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> Contradicted | None:
         """Motion sources that sightings contradict; None: sightings cannot decide, or no decision is due.

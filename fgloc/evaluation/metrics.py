@@ -341,7 +341,7 @@ class ProtectionMetrics(BaseModel):
     median_m: float  # of the bounds on the position
     p95_m: float
     median_yaw_deg: float
-    alert_share: float  # of the poses whose bound is above the alert limit; 0 without a limit
+    alert_share: float  # of the poses whose bound is above the alert limit, or that have none
     causes: dict[str, float]  # shares of the poses, by what their bound is due to
     exceeded: float | None  # share of the poses that are wrong by more than their bound; None: no truth
     dangerous: float | None  # likewise, without an alert
@@ -532,7 +532,7 @@ def protection_metrics(result: RunData, matched: Matched | None) -> ProtectionMe
 
 
 def beyond_bounds(result: RunData, matched: Matched) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Of each matched pose ``(n,)``: whether its error exceeds its bound, and whether there was an alert."""
+    """Two masks ``(n,)`` of the matched poses: those whose error exceeds its bound, and those with an alert."""
     at = np.searchsorted(result.trajectory.stamps_ns, matched.stamps_ns)
     bounds = np.array([result.protections[i].bound for i in at])
     errors, yaw = matched.errors, matched.estimate[:, 2]

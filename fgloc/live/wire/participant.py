@@ -314,7 +314,7 @@ class Participant:
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.DurabilityService(0, Policy.History.KeepLast(_LATCHED_DEPTH), -1, -1, -1),
             Policy.DataRepresentation(use_cdrv0_representation=True),
-            _said_hash(types, message_type),
+            _hash_policy(types, message_type),
         )
         writer = DataWriter(self._participant, entity, qos=qos)
         return Writer(writer, entity.data_type, partial(types.encode, message_type))
@@ -337,7 +337,7 @@ class Participant:
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.DataRepresentation(use_cdrv0_representation=True),
             Policy.IgnoreLocal.Participant,  # what we publish is no input
-            _said_hash(types, message_type),
+            _hash_policy(types, message_type),
         )
         reader = DataReader(self._participant, entity, qos=qos)
         unread = ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead)
@@ -401,11 +401,12 @@ class Participant:
                 self._failure = self._failure or error
 
 
-def _said_hash(messages: Messages, message_type: str) -> Any:
-    """Policy by which an endpoint tells its type's hash, as rmw_cyclonedds and rmw_fastrtps do from Iron on."""
+def _hash_policy(messages: Messages, message_type: str) -> Any:
+    """USER_DATA with the hash of a message type, as ROS 2's middlewares announce it from Iron on; empty without one."""
     from cyclonedds.qos import Policy
 
-    return Policy.Userdata(f"typehash={messages.type_hash(message_type)};".encode())
+    type_hash = messages.type_hash(message_type)
+    return Policy.Userdata(f"typehash={type_hash};".encode() if type_hash else b"")
 
 
 def _loopback(domain: int) -> Domain:
