@@ -12,6 +12,8 @@ BIN := .venv/bin
 # One thread per process: the work is many small problems, and JOBS processes share the cores.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Tests and examples start many processes: each would compile all it imports anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo follow quick other test test-all coverage check equal format bench docs docs-test dist clean
 

@@ -13,8 +13,8 @@ import numpy as np
 from fgloc.config import Config, Role, WheelsConfig, one_line, setting, with_value
 from fgloc.diagnosis.handling import Handling
 from fgloc.diagnosis.landmark_fits import Noise
-from fgloc.diagnosis.pairs import Figure
-from fgloc.diagnosis.signals import Signals
+from fgloc.diagnosis.pairs import Figure, RateFit, fit_rate
+from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 WHEELS: dict[str, Role] = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
@@ -46,6 +46,7 @@ class Conventions:
         opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
         commanded: whether commands stand in for wheels.
         wheels: with which the wheels' path was read; what is found since then is not in it.
+        turns: fits of turns about axes of the IMU that were made so far, with what they were made of.
     """
 
     config: Config
@@ -60,6 +61,17 @@ class Conventions:
     opposite: bool = False
     commanded: bool = False
     wheels: WheelsConfig = field(default_factory=WheelsConfig)
+    turns: list[tuple[Path, Signals, FloatArray, RateFit | None]] = field(default_factory=list)
+
+    def turn_about(self, path: Path, axis: FloatArray) -> RateFit | None:
+        """Fit of the IMU's turn about an axis ``(3,)`` of its own against a path's turn, made once."""
+        for of_path, signals, about, fit in self.turns:
+            if of_path is path and signals is self.signals and np.array_equal(about, axis):
+                return fit
+        rates = self.signals.rates()
+        fit = None if rates is None else fit_rate(path, rates[0], turn_by(rates[0], rates[1] @ axis))
+        self.turns.append((path, self.signals, axis, fit))
+        return fit
 
     @property
     def up(self) -> FloatArray:

@@ -11,8 +11,8 @@ import numpy as np
 
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.handling import Span, cut, handling, outside
-from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit, fit_rate
-from fgloc.diagnosis.signals import Path, turn_by
+from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit
+from fgloc.diagnosis.signals import Path
 from fgloc.frames import rotation_of, sensor_pose
 from fgloc.types import FloatArray, Severity
 
@@ -25,10 +25,10 @@ _GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is
 
 def by_odometry(found: Conventions, path: Path) -> RateFit | None:
     """Compare the gyro with an odometry whose yaw is the gyro's, where the wheels' angles do not tell its turns."""
-    driver, rates = found.signals.odometry_path(), found.signals.rates()
-    if path.source != "ticks" or driver is None or rates is None:
+    driver = found.signals.odometry_path()
+    if path.source != "ticks" or driver is None or found.signals.rates() is None:
         return None
-    by_angles = [fit_rate(path, rates[0], turn_by(rates[0], rate)) for rate in rates[1].T]
+    by_angles = (found.turn_about(path, axis) for axis in np.eye(3)[::-1])
     if any(fit is not None and fit.share > TELLS for fit in by_angles):
         return None
     trial = found.trial()
@@ -79,12 +79,11 @@ def check_gyro(found: Conventions, path: Path) -> RateFit | None:
     rates = found.signals.rates()
     if rates is None:
         return None
-    times, omega, force = rates
-    turned = np.column_stack([turn_by(times, rate) for rate in omega.T])
+    force = rates[2]
     given = found.config.gyro.scale
     sign = math.copysign(1.0, given)
     up = found.up * (sign if found.imu_up is None else 1.0)  # a mounting has the sign of the scale in it
-    configured = fit_rate(path, times, turned @ up * abs(given))
+    configured = found.turn_about(path, up * abs(given))
     gravity = _gravity_axis(force)
     if configured is not None and configured.share > TELLS and configured.scale.value > 0.0:
         check_gravity(found, force, up * sign)
@@ -92,7 +91,8 @@ def check_gyro(found: Conventions, path: Path) -> RateFit | None:
     if configured is not None and configured.share > TELLS and gravity is not None and gravity @ up * sign > 0.5:
         found.opposite = True  # the IMU stands upright: wheels or gyro count the other way
         return replace(configured, scale=replace(configured.scale, value=-configured.scale.value))
-    fits = {k: fit for k in range(3) if (fit := fit_rate(path, times, turned[:, k])) is not None and fit.share > TELLS}
+    about = {k: found.turn_about(path, axis) for k, axis in enumerate(np.eye(3))}
+    fits = {k: fit for k, fit in about.items() if fit is not None and fit.share > TELLS}
     if not fits:
         check_gravity(found, force, up * sign)
         return None
@@ -100,7 +100,7 @@ def check_gyro(found: Conventions, path: Path) -> RateFit | None:
     axis = np.zeros(3)
     axis[k] = math.copysign(1.0, fits[k].scale.value)
     _set_axis(found, axis, gravity, fits[k])
-    again = fit_rate(path, times, turned @ axis * abs(found.config.gyro.scale))
+    again = found.turn_about(path, axis * abs(found.config.gyro.scale))
     return None if again is None else _check_scale(found, again)
 
 

@@ -127,10 +127,13 @@ def fit_sightings(
         return {}
     names = names or (list(AXES) if seen.spatial else ["body", "body, upside down"])
     lags = np.arange(-MOST_LAG_S, MOST_LAG_S + 1e-9, _LAG_STEP_S)
+    poses = [
+        (*complex_poses(path, seen.times[first] - lag), *complex_poses(path, seen.times[last] - lag)) for lag in lags
+    ]
     found = {}
     for name in names:
         z = planar(seen.points, name)
-        fits = [_similarity(path, seen.times, z, first, last, float(lag)) for lag in lags]
+        fits = [_similarity(at_lag, z[first], z[last]) for at_lag in poses]
         best = min(range(len(fits)), key=lambda k: fits[k][2])
         alpha, beta, misfit = fits[best]
         if np.isfinite(misfit):
@@ -161,16 +164,15 @@ def _pairs(seen: Sightings, path: Path) -> tuple[IntArray, IntArray]:
 
 
 def _similarity(
-    path: Path, times: FloatArray, z: ComplexArray, first: IntArray, last: IntArray, late: float
+    poses: tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray], z1: ComplexArray, z2: ComplexArray
 ) -> tuple[complex, complex, float]:
-    """Scale and yaw (as one complex number) and place of the sensor for a lag, and the misfit in the sensor's unit.
+    """Scale and yaw (as one complex number) and place of the sensor, and the misfit in the sensor's unit.
 
-    A landmark that stands still is at one place: ``p_i + R_i (α z_i + β) = p_j + R_j (α z_j + β)``, which is linear in
-    α and β.
+    A landmark that stands still is at one place: ``p_1 + R_1 (α z_1 + β) = p_2 + R_2 (α z_2 + β)``, which is linear in
+    α and β. The poses of the robot are p_1, R_1, p_2, R_2, ``(n,)`` each.
     """
-    p1, r1 = complex_poses(path, times[first] - late)
-    p2, r2 = complex_poses(path, times[last] - late)
-    A = np.column_stack([r1 * z[first] - r2 * z[last], r1 - r2])
+    p1, r1, p2, r2 = poses
+    A = np.column_stack([r1 * z1 - r2 * z2, r1 - r2])
     x, residual = irls(A, p2 - p1, 1e-9, SITS)
     size = abs(x[0])
     return complex(x[0]), complex(x[1]), math.inf if size < 1e-9 else float(np.median(residual)) / size

@@ -230,9 +230,9 @@ def check_angles(found: Conventions, path: Path) -> Path:
     way, turn = fit_way(path, driver.times, driver.way), fit_rate(path, driver.times, driver.poses[:, 2])
     factor = 0.0 if way is None or way.share < TELLS else way.scale.value  # by the angles, over the odometry's
     turns = 0.0 if turn is None or turn.share < TELLS else turn.scale.value
-    wheels, rates = found.config.wheels, found.signals.rates()
-    if turns < 0.0 and rates is not None:
-        gyro = fit_rate(path, rates[0], turn_by(rates[0], rates[1] @ found.up) * found.config.gyro.scale)
+    wheels = found.config.wheels
+    if turns < 0.0:
+        gyro = found.turn_about(path, found.up * found.config.gyro.scale)
         if gyro is not None and gyro.share > TELLS and gyro.scale.value > 0.0:
             return path  # the odometry is wrong, and not used
     fitted, radius = settings_of(found.signals.motion), wheels.left_radius

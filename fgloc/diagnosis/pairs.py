@@ -72,9 +72,10 @@ def irls(A: ComplexArray, y: ComplexArray, floor: float, prior: float = 0.0) -> 
     weights = np.ones(len(y))
     x, residual = np.zeros(A.shape[1], dtype=complex), np.abs(y)
     for _ in range(_REWEIGHTED):
-        H = (A.conj().T * weights) @ A
+        weighted_rows = A.conj().T * weights
+        H = weighted_rows @ A
         H[-1, -1] += prior * weights.sum() / len(y)
-        x = np.linalg.solve(H + 1e-12 * np.eye(len(x)), (A.conj().T * weights) @ y)
+        x = np.linalg.solve(H + 1e-12 * np.eye(len(x)), weighted_rows @ y)
         residual = np.abs(A @ x - y)
         weights = 1.0 / (1.0 + (residual / (CAUCHY * (MAD * float(np.median(residual)) + floor))) ** 2)
     return x, residual
@@ -120,22 +121,22 @@ def fit_rate(path: Path, times: FloatArray, integral: FloatArray, longest_s: flo
     if float(np.sqrt(np.mean(reference**2))) < 0.03:
         return None
 
-    def rate(late: float, half_s: float = _RATE_HALF_S) -> FloatArray:
-        later = np.interp(at + late + half_s, times, integral)
-        return np.asarray((later - np.interp(at + late - half_s, times, integral)) / (2.0 * half_s))
+    def rates(late: FloatArray, half_s: float) -> FloatArray:
+        later = np.interp(at + late[:, None] + half_s, times, integral)
+        return np.asarray((later - np.interp(at + late[:, None] - half_s, times, integral)) / (2.0 * half_s))
 
-    late, share = best_lag(lambda tau: explained(reference, rate(tau))[1], longest_s)
+    late, share = best_lag(lambda lags: explained(reference, rates(lags, _RATE_HALF_S))[1], longest_s)
     turned = path.yaw_rate(at, _TURN_HALF_S)  # over longer: a driver's filter takes from short turns
-    scale = explained(turned, rate(late, _TURN_HALF_S))[0]
-    parts = np.array_split(np.arange(len(at)), BLOCKS)
+    scale = float(explained(turned, rates(np.array([late]), _TURN_HALF_S))[0][0])
+    near = np.arange(late - 0.1, late + 0.1001, 0.02)
+    nearby = rates(near, _RATE_HALF_S)
     left_out = []
-    for part in parts:
+    for part in np.array_split(np.arange(len(at)), BLOCKS):
         use = np.ones(len(at), dtype=bool)
         use[part] = False
-        near = np.arange(late - 0.1, late + 0.1001, 0.02)
-        shares = [explained(reference[use], rate(float(tau))[use])[1] for tau in near]
-        at_best = _vertex(near, np.array(shares))
-        left_out.append((explained(turned[use], rate(at_best, _TURN_HALF_S)[use])[0], at_best))
+        at_best = _vertex(near, explained(reference[use], nearby[:, use])[1])
+        slope = explained(turned[use], rates(np.array([at_best]), _TURN_HALF_S)[:, use])[0][0]
+        left_out.append((float(slope), at_best))
     sigmas = jackknife(np.array(left_out))
     return RateFit(Figure(scale, float(sigmas[0])), Figure(late, float(sigmas[1]) + 0.002), share)
 
@@ -146,12 +147,11 @@ def fit_way(path: Path, times: FloatArray, way: FloatArray) -> RateFit | None:
     return fit_rate(Path(path.times, along, path.gaps), times, way)
 
 
-def best_lag(share: Callable[[float], float], longest_s: float) -> tuple[float, float]:
-    """Lag [s] at which two signals share most, and that share."""
+def best_lag(shares: Callable[[FloatArray], FloatArray], longest_s: float) -> tuple[float, float]:
+    """Lag [s] at which two signals share most, and that share, by the shares ``(m,)`` at lags ``(m,)``."""
     coarse = np.arange(-longest_s, longest_s + 1e-9, 0.05)
-    shares = np.array([share(float(tau)) for tau in coarse])
-    near = coarse[int(np.argmax(shares))] + np.arange(-0.06, 0.0601, 0.01)
-    fine = np.array([share(float(tau)) for tau in near])
+    near = coarse[int(np.argmax(shares(coarse)))] + np.arange(-0.06, 0.0601, 0.01)
+    fine = shares(near)
     return _vertex(near, fine), float(fine.max())
 
 
@@ -165,27 +165,28 @@ def _vertex(x: FloatArray, y: FloatArray) -> float:
     return float(x[k] + (0.5 * (a - c) / bend if bend < 0.0 else 0.0) * (x[1] - x[0]))
 
 
-def explained(y: FloatArray, x: FloatArray) -> tuple[float, float]:
-    """Slope of y by x with an offset, robust, and the share of y's variance that it explains, of the inliers."""
-    weights = np.ones(len(y))
-    slope = offset = 0.0
+def explained(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Slopes ``(m,)`` of ``y (n,)`` by each row of ``x (m, n)`` with an offset, robust, and the shares explained.
+
+    A share is of the variance of y's inliers. Both are 0 for a row that does not vary.
+    """
+    weights = np.ones_like(x)
     typical = float(np.sqrt(np.mean(np.minimum(np.abs(y - np.median(y)), _CLIPPED * np.std(y)) ** 2)))
-    if not np.any(np.abs(x) > 1e-12):
-        return 0.0, 0.0
-    for _ in range(6):
-        total = weights.sum()
-        mx, my = float(weights @ x) / total, float(weights @ y) / total
-        varied = float(weights @ (x - mx) ** 2)
-        if varied <= 0.0:
-            return 0.0, 0.0
-        slope = float(weights @ ((x - mx) * (y - my))) / varied
-        offset = my - slope * mx
-        residual = y - slope * x - offset
+    constant = ~np.any(np.abs(x) > 1e-12, axis=1)
+    for _ in range(_REWEIGHTED):
+        total = weights.sum(axis=1)
+        dx = x - (np.einsum("ij,ij->i", weights, x) / total)[:, None]
+        dy = y - (weights @ y / total)[:, None]
+        weighted_dx = weights * dx
+        variance = np.einsum("ij,ij->i", weighted_dx, dx)
+        constant |= variance <= 0.0
+        slope = np.einsum("ij,ij->i", weighted_dx, dy) / np.where(constant, 1.0, variance)
+        residual = np.abs(dy - slope[:, None] * dx)
         # a robot that mostly stands makes the median a lie: what it does while it turns must count
-        spread = max(MAD * float(np.median(np.abs(residual))), 0.2 * typical) + 1e-9
-        weights = 1.0 / (1.0 + (residual / (CAUCHY * spread)) ** 2)
-    capped = np.minimum(np.abs(residual), _CLIPPED * typical)
-    return slope, 1.0 - float(np.mean(capped**2)) / max(typical**2, 1e-12)
+        spread = np.maximum(MAD * np.median(residual, axis=1), 0.2 * typical) + 1e-9
+        weights = 1.0 / (1.0 + (residual / (CAUCHY * spread)[:, None]) ** 2)
+    left = np.mean(np.minimum(residual, _CLIPPED * typical) ** 2, axis=1)
+    return np.where(constant, 0.0, slope), np.where(constant, 0.0, 1.0 - left / max(typical**2, 1e-12))
 
 
 def varied(path: Path) -> bool:
@@ -200,5 +201,8 @@ def varied(path: Path) -> bool:
 
 def complex_poses(path: Path, times: FloatArray) -> tuple[ComplexArray, ComplexArray]:
     """Places x + iy and directions e^(i yaw) of a path at some times, ``(n,)`` each."""
-    poses = path.at(times)
-    return poses[:, 0] + 1j * poses[:, 1], np.exp(1j * poses[:, 2])
+    outside = (times < path.times[0]) | (times > path.times[-1])
+    place: ComplexArray = np.interp(times, path.times, path.poses[:, 0] + 1j * path.poses[:, 1])  # type: ignore[assignment]
+    direction = np.exp(1j * np.interp(times, path.times, path.poses[:, 2]))
+    place[outside] = direction[outside] = np.nan
+    return place, direction

@@ -148,11 +148,11 @@ def _speed_lag(path: Path, poses: FloatArray, start: FloatArray, window_s: float
     """Lag [s] by the distances, for a body whose yaw is no measure of it."""
     way = np.abs(np.diff([np.interp(start + d, path.times, _length(path.poses[:, :2])) for d in (0.0, 0.4)], axis=0)[0])
 
-    def share(tau: float) -> float:
-        moved = np.abs(_at(poses, start + tau + 0.4)[0] - _at(poses, start + tau)[0])
-        return explained(way, np.asarray(moved))[1]
+    def shares(lags: FloatArray) -> FloatArray:
+        at = start + lags[:, None]
+        return explained(way, np.abs(_at(poses, at + 0.4)[0] - _at(poses, at)[0]))[1]
 
-    return best_lag(share, MOST_LAG_S)[0]
+    return best_lag(shares, MOST_LAG_S)[0]
 
 
 def _length(places: FloatArray) -> FloatArray:
@@ -178,7 +178,7 @@ def _body(
     phi = np.interp(start + window_s, path.times, path.poses[:, 2]) - np.interp(start, path.times, path.poses[:, 2])
     turns = 1.0
     if float(np.std(phi)) > 0.05:
-        turns, share = explained(turned, phi)
+        turns, share = (float(of[0]) for of in explained(turned, phi[None]))
         if 0.0 < turns < 1.0 and share > 0.0:  # the wheels' noise makes it smaller, by down to the share explained
             turns = min(1.0, turns / share)
     x, residual = irls(np.column_stack([own, -(turn - 1.0)]), base, 1e-6, SITS)
