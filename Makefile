@@ -3,7 +3,7 @@
 PYTHON ?= python3
 OTHER ?= python3.13
 JOBS ?= 2
-BENCHMARKS ?= steps real sim identification adaptive ablation gross
+BENCHMARKS ?= steps real installed identification gross
 QUICK ?= $(addprefix tests/,test_layout.py test_fault_catalogue.py docs files intake view graph/test_graph.py graph/test_observation.py)
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c

@@ -26,10 +26,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.adaptive_recordings import Recorded
-from benchmarks.adaptive_runs import changed, failure
 from benchmarks.common import Row, main
-from benchmarks.installed_recordings import SEEDS, Take, load
+from benchmarks.recordings import SEEDS, Recorded, Take, changed, load
+from benchmarks.replays import failure
 from fgloc import se2
 from fgloc.ablation.failures import corrupt, generators
 from fgloc.evaluation.metrics import compute_metrics

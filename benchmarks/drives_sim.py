@@ -6,7 +6,7 @@ those that `CornerDetector` finds, without rendering, at 5 Hz. None has learned 
 measure of the others: ``sim.DRIVE.CASE.MODE.ate_mm`` is the mean distance from the truth, ``.over_differential`` its ratio
 to the differential robot's, ``.nees`` NEES/3, each a mean over the seeds.
 
-Noise of the wheels is that of the simulator's robots; of other seeds only 91 was looked at. Finished cells are kept (`benchmarks.installed_runs.kept`).
+Noise of the wheels is that of the simulator's robots; of other seeds only 91 was looked at. Finished cells are kept (`benchmarks.replays.kept`).
 """
 
 # ruff: noqa: E501 (lines of the description)
@@ -25,11 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.adaptive_recordings import Recorded, cache_folder, scenario
-from benchmarks.adaptive_runs import failure, replayed
 from benchmarks.common import Row
-from benchmarks.installed_runs import kept
-from benchmarks.installed_scores import errors
+from benchmarks.recordings import Recorded, cache_folder, scenario
+from benchmarks.replays import failure, kept, replayed
+from benchmarks.scores import errors
 from fgloc.config import config_of
 from fgloc.errors import FglocError
 from fgloc.files.atomic import atomic_folder

@@ -11,6 +11,7 @@ import math
 import re
 import sys
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +26,6 @@ from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from benchmarks.example_sensors import example_sensors
 from benchmarks.field_recordings import DATA, RECORDINGS
 from benchmarks.gross_recordings import MISTAKES, Mistake
 from benchmarks.gross_recordings import write as write_mistaken
@@ -33,6 +33,7 @@ from fgloc import LandmarkMap, Live, RunResult, load_config, load_map, run, se2
 from fgloc.ablation.failures import AnyFailure, corrupt, generators
 from fgloc.cli import app
 from fgloc.config import config_of, file_content
+from fgloc.extensions import GROUP, outside_sensors
 from fgloc.files.settings import joined
 from fgloc.recording.reader import open_recording
 from fgloc.replay import RunMode
@@ -42,6 +43,7 @@ from fgloc.types import Estimate, Event, FloatArray, Landmark
 from fgloc_datasets.bag import BagWriter
 
 SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
+_EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 Settings = dict[str, dict[str, Any]]
 Found = dict[str, Any]
 """What a case found by aspect: what is hashed; under "rows", poses with sigmas, for comparison by value."""
@@ -418,6 +420,31 @@ def _first(seconds: float, events: Iterator[Event]) -> Iterator[Event]:
     first = next(events)
     yield first
     yield from takewhile(lambda e: e.received_ns < first.received_ns + seconds * 1e9, events)
+
+
+@contextlib.contextmanager
+def example_sensors() -> Iterator[tuple[Path, Path]]:
+    """While inside, fgloc finds the sensors of ``examples/`` as those of an installed package, without installing it.
+
+    The two folders are those to put on PYTHONPATH for another process.
+    """
+    with tempfile.TemporaryDirectory(prefix="fgloc-sensors-") as name:
+        folders = Path(name), _EXAMPLES
+        project = tomllib.loads((_EXAMPLES / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        info = folders[0] / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+        info.mkdir()
+        about = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+        (info / "METADATA").write_text(about)
+        points = "".join(f"{name} = {value}\n" for name, value in project["entry-points"][GROUP].items())
+        (info / "entry_points.txt").write_text(f"[{GROUP}]\n{points}")
+        sys.path.extend(map(str, folders))
+        outside_sensors.cache_clear()
+        try:
+            yield folders
+        finally:
+            for folder in folders:
+                sys.path.remove(str(folder))
+            outside_sensors.cache_clear()
 
 
 def _radio(non_line_of_sight: str, *, place: Path) -> Found:

@@ -44,7 +44,7 @@ from benchmarks.common import Row, main, not_run
 from benchmarks.field_peers import Heard, hear, textbook
 from benchmarks.field_recordings import DATA, RECORDINGS, Recording
 from benchmarks.field_sheet import MODES, SHEET, SOUND, Mode, Outcome, false_findings, found, right_cause
-from benchmarks.installed_runs import kept
+from benchmarks.replays import kept
 from fgloc import se2
 from fgloc.files.atomic import atomic_file
 from fgloc.files.outputs import read_tum

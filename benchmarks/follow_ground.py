@@ -24,9 +24,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.adaptive_recordings import cache_folder
 from benchmarks.common import Row
 from benchmarks.follow_runs import source_hash
+from benchmarks.recordings import cache_folder
 from fgloc.config import Config, load_config
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import compute_metrics, match_result

@@ -18,7 +18,7 @@ from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
-from benchmarks.adaptive_recordings import cache_folder
+from benchmarks.recordings import cache_folder
 from fgloc.errors import FglocError
 from fgloc.files.atomic import atomic_file
 from fgloc_datasets.sim.following import PoseName, follow

@@ -23,10 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.adaptive_recordings import Split, cache_folder
 from benchmarks.common import Row, main, not_run
 from benchmarks.gross_recordings import MISTAKES, write
-from benchmarks.installed_recordings import SEEDS, Take, folder, prepare
+from benchmarks.recordings import SEEDS, Split, Take, cache_folder, folder, prepare
 from fgloc.cli.terminal import EXIT_BAD_INPUT, exit_code
 from fgloc.config import load_config
 from fgloc.diagnosis.mistakes import inspect_all

@@ -2,158 +2,169 @@
 
 Every model is trained here, by the default configuration, once per seed; values are means over the seeds, spreads their
 standard deviation. Drift is the summed end error over the summed distance, windows start every second and are pooled
-over the robots. ``loro`` leaves one robot out of training, early stopping and calibration, and tests on it. ``seen``
-trains on the first 60 % of each robot's run, stops and calibrates on the next 10 %, tests on the last 30 %. Where the
-truth slides sideways faster than 0.012 m/s, as no wheel does, Vicon jumped: such samples are cut everywhere, and
-``*.uncut_...`` tests the same models with them. Coverage at one step is that of a step of 0.2 s. ``finetune`` adapts
-the models of ``loro`` to the first minute of the robot left out, and tests both on the rest. ``selftruth`` trains as
-``loro`` does, once on Vicon's poses and once on what ``fgloc smooth`` makes of the same runs without a learned model,
-each robot's commands calibrated by its own sightings (``fgloc calibrate``); both are tested against Vicon. ``limits``,
-``husky`` and ``sim``: see `benchmarks.identification_limits`, `_husky` and `_sim`.
+over the robots. Coverage at one step is that of a step of 0.2 s.
+
+MRCLAM 6: ``loro`` leaves one robot out of training, early stopping and calibration, and tests on it. ``seen`` trains on
+the first 60 % of each robot's run, stops and calibrates on the next 10 %, tests on the last 30 %. Where the truth
+slides sideways faster than 0.012 m/s, as no wheel does, Vicon jumped: such samples are cut. ``finetune`` adapts the
+models of ``loro`` to the first minute of the robot left out, and tests both on the rest. ``commands`` integrates the
+commands.
+
+``husky``: DRIVE's skid-steered robot, windows of 2 s, three to a calibration step of the recording; a step's windows
+stay together. The first 120 steps train, the next 30 stop the training early and calibrate, the last 51 test. The model
+predicts 1.5 s of each test window, from 0.3 s after its start, from commands and wheel speeds (``husky``), or from the
+gyro as well (``husky_gyro``); the errors are means over the windows. One window in twenty is left out, as its ICP falls
+silent before. ``husky.wheels_...`` is wheel odometry with the nominal track; the gyro's bias is taken as 0, as a window
+holds no rest.
+
+``sim``: models of the simulated robot, on runs recorded here. Ratios are the mean position error of the model over 5 s
+windows divided by that of the wheel odometry (the robot's ``robot.yaml``), on test runs whose seeds and control
+functions no training has seen. ``mu02`` and ``mu01``: a floor of friction 0.2 and 0.1, a model of commands and gyro.
+``radii``: unequal wheels, commands and wheel speed. ``patches``: slippery patches, commands, gyro and effort;
+``patches_plain`` the same of commands alone. The gyro's bias is what the localizer's filter knew 10 s before, of rests
+and of fixes by the truth.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks import identification_husky, identification_limits, identification_sim
 from benchmarks.common import Row, main, not_run
-from fgloc.calibrate import calibrate
+from benchmarks.recordings import DATA, MRCLAM
 from fgloc.config import load_config
+from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
-from fgloc.runner import run
-from fgloc.sensors.learned.card import Kinematics, Split
-from fgloc.sensors.learned.network import MotionModel
-from fgloc.sensors.learned.sensor import load_model, model_of, read_model, save_model
-from fgloc.types import ControlEvent, FloatArray
-from fgloc_datasets import mrclam
+from fgloc.recording.truth import base_pose
+from fgloc.sensors.learned.card import Input, Kinematics, Split
+from fgloc.sensors.learned.sensor import load_model, model_of, read_model
+from fgloc.types import ControlEvent, Event, TruthEvent
+from fgloc_datasets import drive, mrclam
+from fgloc_datasets.sim.record import BUNDLED, Job, jobs, load_suite, record_suite
 from fgloc_training.calibrate import adapted
-from fgloc_training.config import AdaptationConfig, DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
-from fgloc_training.data import Run, cut, make_run
-from fgloc_training.evaluate import STEP_S, Figures, evaluate
-from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model
+from fgloc_training.config import (
+    AdaptationConfig,
+    CalibrationConfig,
+    DataConfig,
+    NetworkConfig,
+    OptimizationConfig,
+    TrainConfig,
+)
+from fgloc_training.data import Run, SensorRecord, cut, load_run, make_run
+from fgloc_training.evaluate import STEP_S, evaluate
+from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
 from fgloc_training.train import leave_one_out, train
 
-_ROOT = Path(__file__).resolve().parent.parent
-_DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
-_MODEL = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam" / "all.safetensors"
 _HORIZONS_S = (10.0, 30.0, 60.0)
-_SHARES = (0.6, 0.7)  # of a run: what trains ends, what validates ends
-_WHOLE = DataConfig()
-_CUT = DataConfig(max_sideways_mps=0.012)  # Vicon's axes are off by 1.2° at most and its point by 5 mm: 0.005 m/s
-_SMOOTHED = DataConfig(max_truth_gap_s=0.35)  # keyframes may be 0.2 s apart
-_SMOOTHED_SETTINGS = OptimizationConfig(horizon_s=8.0, batch=48)
-_SMOOTHED_ADAPTATION = AdaptationConfig(after_training_s=60.0)
 _MINUTE_S = 60.0
+_PARTS = (0.6, 0.7)  # of a run: what trains ends, what validates ends
+_CUT = DataConfig(max_sideways_mps=0.012)  # Vicon's axes are off by 1.2° at most and its point by 5 mm: 0.005 m/s
 _QUICK = OptimizationConfig(iterations=60, validate_every=30, variance_iterations=20)
 _COVERAGE = [f"cov{when}{i}" for when in ("", "10s_") for i in (1, 2, 3)]
-_STEPS = 4000
+
+_WINDOWS = {"train": range(120), "validation": range(120, 150), "test": range(150, 201)}  # calibration steps
+_HUSKY_S = 1.5
+_HUSKY_DT_S = 0.1
+_APART_NS = 10_000_000_000  # of a silence between two windows
+_HISTORY_S = 0.3  # of a window, before the prediction starts
+_HUSKY_DATA = DataConfig(smoothing_s=0.3, max_truth_gap_s=0.4, margin_s=0.0, shortest_s=_HUSKY_S)
+_HUSKY_CALIBRATION = CalibrationConfig(horizons_s=(1.0, _HUSKY_S), short_s=(0.1, 0.5), window_s=_HUSKY_S)
+
+_SIM_SEEDS = {"train": (11, 12, 13, 14), "validation": (21, 22, 23), "test": (31, 32, 33, 34)}
+_SIM_S = 5.0
+_SIM_DATA = DataConfig(smoothing_s=0.1)  # the truth is exact
+_SIM_QUICK_S = 40.0
+_SIM: dict[str, tuple[str, tuple[Input, ...]]] = {  # scenario and inputs
+    "mu02": ("slick", ("commands", "gyro")),
+    "mu01": ("slippery", ("commands", "gyro")),
+    "radii": ("unequal_radii", ("commands", "wheels")),
+    "patches": ("patches", ("commands", "gyro", "effort")),
+    "patches_plain": ("patches", ("commands",)),
+}
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """Yield every row; a quick run has one seed, few iterations and leaves out the smoothing."""
+    """Yield every row; a quick run has one seed and few iterations."""
     torch.set_num_threads(1)
     seeds = range(1) if quick else range(3)
     optimization = _QUICK if quick else OptimizationConfig()
     with tempfile.TemporaryDirectory() as scratch:
-        yield from _mrclam(Path(scratch), seeds, optimization, quick)
-        yield _inference("infer.step_us", load_model(_MODEL), quick)
-        yield _inference("infer.ensemble5_us", _ensemble(Path(scratch)), quick)
+        yield from _mrclam(Path(scratch), seeds, optimization)
         yield from _husky(Path(scratch), seeds, optimization)
-        yield from identification_sim.measure(quick, seeds, optimization, Path(scratch))
+        yield from _simulated(quick, seeds, optimization, Path(scratch))
 
 
-def _husky(scratch: Path, seeds: range, optimization: OptimizationConfig) -> Iterator[Row]:
-    sources = sorted((_DATA / "drive_husky").glob("*.csv"))
-    if sources:
-        yield from identification_husky.measure(sources[0], seeds, optimization, scratch)
-    else:
-        yield from not_run(["husky.end_m", "husky.end_rad"], f"no {_DATA / 'drive_husky'}; set FGLOC_REAL_DATA")
+def _trained(
+    path: Path, split: Split, runs: dict[str, Run], optimization: OptimizationConfig, **config: object
+) -> Path:
+    """File of a model of the split's training runs."""
+    given = {"robot": "benchmark", "recordings": {name: Path(name) for name in runs}, "split": split}
+    train(TrainConfig(**given, optimization=optimization, **config), split, runs, path, "benchmarks.identification")
+    return path
 
 
-def _mrclam(scratch: Path, seeds: range, optimization: OptimizationConfig, quick: bool) -> Iterator[Row]:
-    source = _DATA / "mrclam6"
-    if not source.is_dir():
-        names = [f"drift_{h:.0f}s" for h in _HORIZONS_S] + _COVERAGE
-        ids = [f"{on}.{name}" for on in ("loro", "seen") for name in names]
-        ids += ["seen.yaw_10s_deg", "selftruth.drift_ratio", "train.minutes"]
-        yield from not_run(ids, f"no {source}; set FGLOC_REAL_DATA")
-        return
-    recorded = {f"robot{k}": mrclam.read(source, k) for k in mrclam.ROBOTS}
-    runs, uncut = ({name: _run(r, name, data) for name, r in recorded.items()} for data in (_CUT, _WHOLE))
-    commands = [roll_kinematics(Kinematics(), r, STEP_S) for r in uncut.values()]
-    for horizon in _HORIZONS_S:
-        yield Row(f"commands.drift_{horizon:.0f}s", evaluate(commands, horizon).drift_percent, unit="%")
-    yield from identification_limits.measure(recorded)
-    trainer = _Trainer(scratch, optimization)
-    parts, split = _parts(runs)
-    whole, _ = _parts(uncut)
-    models = [trainer.trained(seed, split, parts) for seed in seeds]
-    seen = [_tested(path, split, parts) for path in models]
-    yield from _figures("seen", seen)
-    yield _row("seen.yaw_10s_deg", [evaluate(r, 10.0).yaw_end_deg for r in seen], "deg")
-    yield from _drifts("seen.uncut_", [_tested(path, split, whole) for path in models])
-    left_out = [trainer.leave_one_out(seed, runs) for seed in seeds]
-    loro = [[r for path, s in models for r in _tested(path, s, runs)] for models in left_out]
-    yield from _figures("loro", loro)
-    yield from _drifts("loro.uncut_", [[r for p, s in models for r in _tested(p, s, uncut)] for models in left_out])
-    yield _row("train.minutes", trainer.minutes, "min")
-    yield from _finetuned(left_out, runs)
-    if quick:
-        yield from not_run(["selftruth.drift_ratio"], "left out of a quick run")
-        return
-    own = {name: _smoothed(source, k, runs[name], scratch) for k, name in enumerate(runs, 1)}
-    (scratch / "own").mkdir()
-    trainer = _Trainer(scratch / "own", _SMOOTHED_SETTINGS, _SMOOTHED_ADAPTATION)
-    ratios = []
-    for seed, vicon in zip(seeds, loro, strict=True):
-        rollouts = [r for path, s in trainer.leave_one_out(seed, own) for r in _tested(path, s, runs)]
-        ratios.append(evaluate(rollouts, 30.0).drift_percent / evaluate(vicon, 30.0).drift_percent)
-    yield _row("selftruth.drift_ratio", ratios)
-
-
-class _Trainer:
-    """Trains into a scratch folder and keeps the time that each model took."""
-
-    def __init__(
-        self, scratch: Path, optimization: OptimizationConfig, adaptation: AdaptationConfig | None = None
-    ) -> None:
-        self.minutes: list[float] = []
-        self._scratch = scratch
-        self._optimization = optimization
-        self._adaptation = AdaptationConfig() if adaptation is None else adaptation
-
-    def leave_one_out(self, seed: int, runs: dict[str, Run]) -> list[tuple[Path, Split]]:
-        """For each run a model that has not seen it."""
-        return [(self.trained(seed, split, runs), split) for split in leave_one_out(list(runs))]
-
-    def trained(self, seed: int, split: Split, runs: dict[str, Run]) -> Path:
-        """The file of a model of the split's training runs."""
-        config = TrainConfig(
-            robot="benchmark",
-            recordings={name: Path(name) for name in runs},
-            split=split,
-            optimization=self._optimization.model_copy(update={"seed": seed}),
-            adaptation=self._adaptation,
-        )
-        path = self._scratch / f"{split.test[0]}.{seed}.safetensors"
-        began = time.perf_counter()
-        train(config, split, runs, path, "benchmarks.identification")
-        self.minutes.append((time.perf_counter() - began) / 60.0)
-        return path
-
-
-def _tested(path: Path, split: Split, runs: dict[str, Run]) -> list[Rollout]:
+def _tested(path: Path, split: Split, runs: dict[str, Run], dt_s: float = STEP_S) -> list[Rollout]:
     """The split's test runs, predicted by a model."""
     model = load_model(path)
-    return [roll_model(model, runs[name], STEP_S) for name in split.test]
+    return [roll_model(model, runs[name], dt_s) for name in split.test]
+
+
+def _row(name: str, values: list[float], unit: str = "") -> Row:
+    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+
+
+def _coverages(prefix: str, per_seed: list[list[Rollout]], horizons_s: dict[str, float]) -> Iterator[Row]:
+    """Shares of the errors within one, two and three sigmas, by label of the horizon."""
+    for label, horizon_s in horizons_s.items():
+        shares = np.array([evaluate(rollouts, horizon_s).coverage for rollouts in per_seed], dtype=float)
+        for i, column in enumerate(shares.T, 1):
+            yield _row(f"{prefix}.{label}{i}", column.tolist())
+
+
+def _ends(rollouts: list[Rollout], horizon_s: float) -> tuple[float, float]:
+    """Mean distance [m] and mean angle [rad] between predicted and true ends of the windows."""
+    ends = np.concatenate([rollout.errors(horizon_s) for rollout in rollouts])
+    return float(np.hypot(ends[:, 0], ends[:, 1]).mean()), float(np.abs(ends[:, 2]).mean())
+
+
+# --- MRCLAM -----------------------------------------------------------------------------------------------------------
+
+
+def _mrclam(scratch: Path, seeds: range, optimization: OptimizationConfig) -> Iterator[Row]:
+    if not MRCLAM.is_dir():
+        names = [f"drift_{h:.0f}s" for h in _HORIZONS_S] + _COVERAGE
+        ids = [f"{on}.{name}" for on in ("loro", "seen") for name in names]
+        yield from not_run([*ids, "seen.yaw_10s_deg", "train.minutes"], f"no {MRCLAM}; set FGLOC_REAL_DATA")
+        return
+    recorded = {f"robot{k}": mrclam.read(MRCLAM, k) for k in mrclam.ROBOTS}
+    runs, whole = ({name: _run(r, name, data) for name, r in recorded.items()} for data in (_CUT, DataConfig()))
+    commands = [roll_kinematics(Kinematics(), r, STEP_S) for r in whole.values()]
+    for horizon in _HORIZONS_S:
+        yield Row(f"commands.drift_{horizon:.0f}s", evaluate(commands, horizon).drift_percent, unit="%")
+    minutes: list[float] = []
+
+    def trained(seed: int, split: Split, of: dict[str, Run]) -> Path:
+        began = time.perf_counter()
+        path = scratch / f"{split.test[0]}.{seed}.safetensors"
+        _trained(path, split, of, optimization.model_copy(update={"seed": seed}))
+        minutes.append((time.perf_counter() - began) / 60.0)
+        return path
+
+    parts, split = _parts(runs)
+    seen = [_tested(trained(seed, split, parts), split, parts) for seed in seeds]
+    yield from _figures("seen", seen)
+    yield _row("seen.yaw_10s_deg", [evaluate(r, 10.0).yaw_end_deg for r in seen], "deg")
+    left_out = [[(trained(seed, split, runs), split) for split in leave_one_out(list(runs))] for seed in seeds]
+    yield from _figures("loro", [[r for path, s in models for r in _tested(path, s, runs)] for models in left_out])
+    yield _row("train.minutes", minutes, "min")
+    yield from _finetuned(left_out, runs)
 
 
 def _finetuned(left_out: list[list[tuple[Path, Split]]], runs: dict[str, Run]) -> Iterator[Row]:
@@ -178,23 +189,8 @@ def _finetuned(left_out: list[list[tuple[Path, Split]]], runs: dict[str, Run]) -
 def _run(recorded: mrclam.Run, name: str, data: DataConfig) -> Run:
     pairs = zip(recorded.commands_ns.tolist(), recorded.commands.tolist(), strict=True)
     commands = [ControlEvent(stamp, stamp, "/cmd_vel", v, omega) for stamp, (v, omega) in pairs]
-    return _sampled(name, commands, recorded.truth_ns, recorded.truth, data)
-
-
-def _sampled(name: str, commands: list[ControlEvent], stamps: FloatArray, poses: FloatArray, data: DataConfig) -> Run:
+    stamps, poses = recorded.truth_ns, recorded.truth
     return make_run(name, commands, stamps, poses, NetworkConfig().dt_s, data.history_s, data)
-
-
-def _smoothed(source: Path, robot: int, recorded: Run, scratch: Path) -> Run:
-    """The run with our own batch smoothing in place of its truth, its commands calibrated on the run."""
-    bag = mrclam.convert(source, robot, scratch / f"robot{robot}")
-    robot_yaml = find_beside(bag, "robot.yaml")
-    if robot_yaml is None:
-        raise FileNotFoundError(f"the converter wrote no robot.yaml beside {bag}")
-    map_path = find_beside(bag, "map.yaml")
-    config, _ = calibrate([bag], map_path, load_config(robot_yaml))
-    trajectory = run(bag, map_path, config, "batch").trajectory
-    return _sampled(recorded.name, list(recorded.commands), trajectory.stamps_ns, trajectory.poses, _SMOOTHED)
 
 
 def _parts(runs: dict[str, Run]) -> tuple[dict[str, Run], Split]:
@@ -203,7 +199,7 @@ def _parts(runs: dict[str, Run]) -> tuple[dict[str, Run], Split]:
     roles = ("train", "validation", "test")
     for name, whole in runs.items():
         n = len(whole.poses)
-        limits = [0, *(round(share * n) for share in _SHARES), n]
+        limits = [0, *(round(share * n) for share in _PARTS), n]
         for role, first, last in zip(roles, limits, limits[1:], strict=False):
             parts[f"{name}.{role}"] = cut(whole, f"{name}.{role}", first, last)
     train_names, validation, test = (tuple(p for p in parts if p.endswith(role)) for role in roles)
@@ -213,10 +209,7 @@ def _parts(runs: dict[str, Run]) -> tuple[dict[str, Run], Split]:
 def _figures(on: str, per_seed: list[list[Rollout]]) -> Iterator[Row]:
     """Drifts and coverage, the windows of all robots pooled."""
     yield from _drifts(f"{on}.", per_seed)
-    for label, horizon in (("cov", STEP_S), ("cov10s_", 10.0)):
-        shares = np.array([_coverage(evaluate(r, horizon)) for r in per_seed])
-        for i, column in enumerate(shares.T, 1):
-            yield _row(f"{on}.{label}{i}", column.tolist())
+    yield from _coverages(on, per_seed, {"cov": STEP_S, "cov10s_": 10.0})
 
 
 def _drifts(prefix: str, per_seed: list[list[Rollout]]) -> Iterator[Row]:
@@ -224,43 +217,117 @@ def _drifts(prefix: str, per_seed: list[list[Rollout]]) -> Iterator[Row]:
         yield _row(f"{prefix}drift_{horizon:.0f}s", [evaluate(r, horizon).drift_percent for r in per_seed], "%")
 
 
-def _coverage(figures: Figures) -> tuple[float, float, float]:
-    if figures.coverage is None:
-        raise ValueError("the model gave no covariance")
-    return figures.coverage
+# --- Husky ------------------------------------------------------------------------------------------------------------
 
 
-def _row(name: str, values: list[float], unit: str = "") -> Row:
-    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+def _husky(scratch: Path, seeds: range, optimization: OptimizationConfig) -> Iterator[Row]:
+    sources = sorted((DATA / "drive_husky").glob("*.csv"))
+    if not sources:
+        yield from not_run(["husky.end_m", "husky.end_rad"], f"no {DATA / 'drive_husky'}; set FGLOC_REAL_DATA")
+        return
+    parts = {part: _windows(sources[0], steps, part, scratch) for part, steps in _WINDOWS.items()}
+    runs = {run.name: run for part in parts.values() for run in part}
+    names = {part: tuple(run.name for run in found) for part, found in parts.items()}
+    split = Split(train=names["train"], validation=names["validation"], test=names["test"])
+    wheels = _ends([roll_wheels(run, _HUSKY_DT_S) for run in parts["test"]], _HUSKY_S)
+    yield Row("husky.wheels_end_m", wheels[0], unit="m")
+    yield Row("husky.wheels_end_rad", wheels[1], unit="rad")
+    inputs: dict[str, tuple[Input, ...]] = {
+        "husky": ("commands", "wheels"),
+        "husky_gyro": ("commands", "gyro", "wheels"),
+    }
+    short = {"horizon_s": _HUSKY_S, "variance_horizon_s": _HUSKY_S, "validation_s": (_HUSKY_S,)}
+    for name, reads in inputs.items():
+        per_seed = []
+        for seed in seeds:
+            path = _trained(
+                scratch / "model.safetensors",
+                split,
+                runs,
+                optimization.model_copy(update={"seed": seed, **short}),
+                data=_HUSKY_DATA,
+                network=NetworkConfig(inputs=reads, dt_s=_HUSKY_DT_S, edges_s=(0.0, 0.1, 0.2, 0.3, 0.4)),
+                calibration=_HUSKY_CALIBRATION,
+            )
+            per_seed.append(_tested(path, split, runs, _HUSKY_DT_S))
+        ends = np.array([_ends(rollouts, _HUSKY_S) for rollouts in per_seed])
+        for unit, column in zip(("m", "rad"), ends.T, strict=True):
+            yield _row(f"{name}.end_{unit}", column.tolist(), unit)
+        yield from _coverages(name, per_seed, {"cov": _HUSKY_DT_S, "cov1500ms_": _HUSKY_S})
 
 
-def _ensemble(scratch: Path) -> MotionModel:
-    """Five networks of the shipped model's size; their weights do not change how long they take."""
-    tensors, card = read_model(_MODEL)
-    path = scratch / "ensemble.safetensors"
-    stacked = {name: np.stack([tensor] * 5) for name, tensor in tensors.items()}
-    save_model(path, stacked, card.model_copy(update={"members": 5}))
-    return load_model(path)
+def _windows(source: Path, steps: range, part: str, scratch: Path) -> list[Run]:
+    """The windows of some steps, each a run of its own."""
+    bag = drive.convert(source, scratch / part, calibration=steps)
+    robot_yaml = find_beside(bag, "robot.yaml")
+    if robot_yaml is None:
+        raise FileNotFoundError(f"the converter wrote no robot.yaml beside {bag}")
+    settings = load_config(robot_yaml)
+    with open_recording(bag, settings.recording) as recording:
+        events = sorted(recording.events(), key=lambda e: e.stamp_ns)
+    runs = []
+    for k, window in enumerate(_apart(events)):
+        truth = [e for e in window if isinstance(e, TruthEvent)]
+        if truth[-1].stamp_ns < window[0].stamp_ns + round((_HISTORY_S + _HUSKY_S) * 1e9):
+            continue
+        stamps, poses = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
+        runs.append(
+            make_run(f"{part}_{k}", SensorRecord(window, settings), stamps, poses, _HUSKY_DT_S, _HISTORY_S, _HUSKY_DATA)
+        )
+    return runs
 
 
-def _inference(name: str, model: MotionModel, quick: bool) -> Row:
-    """Median time of one prediction over 0.2 s with commands at 20 Hz, as the localizer asks for them."""
-    period = 50_000_000
-    rng = np.random.default_rng(0)
-    told = rng.uniform([0.0, -0.5], [0.1, 0.5], (4 * _STEPS + 100, 2)).tolist()
-    events = [ControlEvent(i * period, i * period, "/cmd_vel", v, omega) for i, (v, omega) in enumerate(told)]
+def _apart(events: list[Event]) -> list[list[Event]]:
+    """Events in order of stamp, cut where nothing was heard for long."""
+    stamps = np.array([e.stamp_ns for e in events])
+    number = np.concatenate([[0], np.cumsum(np.diff(stamps) > _APART_NS)])
+    return [[e for _, e in group] for _, group in groupby(zip(number, events, strict=True), key=lambda pair: pair[0])]
 
-    def median_us() -> float:
-        times = []
-        for k in range(_STEPS // 10 if quick else _STEPS):
-            i = 40 + 4 * k
-            commands = tuple(events[i - 30 : i + 5])
-            began = time.perf_counter_ns()
-            model.predict(commands, i * period, (i + 4) * period, None)
-            times.append(time.perf_counter_ns() - began)
-        return float(np.median(times)) * 1e-3
 
-    return _row(name, [median_us() for _ in range(3)], "us")
+# --- Simulator --------------------------------------------------------------------------------------------------------
+
+
+def _simulated(quick: bool, seeds: range, optimization: OptimizationConfig, scratch: Path) -> Iterator[Row]:
+    """Record, train once per case and seed, and yield the rows; quick: one short run for each part of the split."""
+    names = {scenario for scenario, _ in _SIM.values()}
+    todo = [job for job in _jobs(quick) if job.scenario.name in names]
+    record_suite(todo, scratch, camera=False, workers=1)
+    dt_s = NetworkConfig().dt_s
+    for scenario in sorted(names):
+        mine = [job for job in todo if job.scenario.name == scenario]
+        runs = {
+            job.folder: load_run(scratch / job.folder / "bag", job.folder, dt_s, _SIM_DATA.history_s, _SIM_DATA)
+            for job in mine
+        }
+        parts = {part: tuple(job.folder for job in mine if job.split == part) for part in _SIM_SEEDS}
+        split = Split(train=parts["train"], validation=parts["validation"], test=parts["test"])
+        wheels, _ = _ends([roll_wheels(runs[name], STEP_S) for name in split.test], _SIM_S)
+        for name, (of, inputs) in _SIM.items():
+            if of != scenario:
+                continue
+            per_seed = []
+            for seed in seeds:
+                path = _trained(
+                    scratch / "model.safetensors",
+                    split,
+                    runs,
+                    optimization.model_copy(update={"seed": seed}),
+                    data=_SIM_DATA,
+                    network=NetworkConfig(inputs=inputs),
+                )
+                per_seed.append(_tested(path, split, runs))
+            yield _row(f"sim.{name}_ratio", [_ends(rollouts, _SIM_S)[0] / wheels for rollouts in per_seed])
+            yield from _coverages(f"sim.{name}", per_seed, {"cov": STEP_S, "cov10s_": 10.0})
+
+
+def _jobs(quick: bool) -> list[Job]:
+    """The bundled suite's runs of robots as they are written, and more of their kind by other seeds."""
+    out: dict[str, Job] = {}
+    for job in jobs(load_suite(BUNDLED).perfect(), _SIM_QUICK_S if quick else None):
+        for seed in _SIM_SEEDS[job.split][: 1 if quick else None]:
+            folder = f"{job.scenario.name}/{job.split}_{seed}"
+            out[folder] = replace(job, seed=seed, folder=folder)
+    return list(out.values())
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Installations: ``python -m benchmarks.installed [--quick] [--json FILE] [--split validation] [--rows PREFIX,...]``.
 
 Simulated recordings in which map, camera, clocks and wheels are not quite as written, with failures of the ablations
-(`benchmarks.installed_recordings`). Values are means over the seeds and spreads their standard deviations, with these
+(`benchmarks.recordings`). Values are means over the seeds and spreads their standard deviations, with these
 exceptions: ``update_*`` are percentiles over the updates of all seeds, ``found.*`` root mean squares over the seeds,
 ``found.coverage3`` a share of all values, and ``textbook.*.best_over_fgloc`` the least mean of the textbook's three
 pipelines (`benchmarks.textbook`) over that of fgloc without learned motion, both online on the same steps.
@@ -11,29 +11,76 @@ pipelines (`benchmarks.textbook`) over that of fgloc without learned motion, bot
 - ``lost_share``: poses of mode LOST without cause. ``refused_share``: sightings not used as given; none is wrong.
 - ``update_*``: processor time of a whole update, all but the detection of markers.
 - ``found.*``: from drives of two minutes. Time offsets are relative to the IMU's stamps.
+- ``map.*``: a robot tours a room of 6 m for three minutes; `fgloc map` is given the dictionary and size of the markers
+  and nothing else, then `fgloc smooth` takes the file that it wrote. ``map.images.rms_mm``, ``.direction_deg``: root
+  mean square over the markers of a run, of their distance from where they hang and of the angle by which they are
+  turned, after SE(3) alignment of the places; ``map.images.missing`` counts the markers that hang there and are not in
+  the map. ``map.fed_back.ate_mm``: mean distance from the truth after SE(2) alignment.
+- ``mrclam.*``: MRCLAM 6, five real robots, each with the constants and the model of the other four.
+  ``first_pose_s`` is from a robot's first motion (the first command to move) to its first pose.
 
 Settings are chosen on the training and validation splits; the rows are of the test split. Finished cells are kept
-(`benchmarks.installed_runs`), so that an interrupted run goes on.
+(`benchmarks.replays`), so that an interrupted run goes on.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from benchmarks import installed_map, installed_mrclam
-from benchmarks.adaptive_recordings import Split
 from benchmarks.common import Row, main, not_run
-from benchmarks.installed_recordings import SEEDS, Take, Variant, prepare
-from benchmarks.installed_runs import CASES, Cell, floor, run_all
-from benchmarks.installed_scores import Scores, inside
-from benchmarks.textbook import PIPELINES
+from benchmarks.recordings import (
+    MRCLAM,
+    SEEDS,
+    Recorded,
+    Split,
+    Take,
+    Variant,
+    cache_folder,
+    changed,
+    converted,
+    folder,
+    load,
+    prepare,
+)
+from benchmarks.replays import Replayed, failures, floor, kept, parallel, processor_times, replayed
+from benchmarks.scores import (
+    Scores,
+    errors,
+    found_by,
+    found_errors,
+    inside,
+    lost_share,
+    map_over_survey,
+    places_in,
+    refused_share,
+)
+from benchmarks.textbook import PIPELINES, Textbook
+from fgloc.calibration.survey import survey
+from fgloc.config import Config, load_config
+from fgloc.errors import FglocError
+from fgloc.evaluation.metrics import match, match_result
+from fgloc.runner import run
+from fgloc.sensors.maps import load_map, write_map
+from fgloc.types import Estimate, LandmarkMap, Step, Trajectory
+from fgloc_datasets import mrclam
 from fgloc_datasets.sim.camera import RenderError
+from fgloc_datasets.sim.installed import INSTALLED, load_installed
+from fgloc_datasets.sim.scenario import Markers
 
+CASES = ("none", "slip", "mu01", "dark30", "dark60", "ids30", "moved", "frozen", "onewheel", "kidnap")
 QUICK_CASES = ("none", "slip")
 TEXTBOOK_CASES = ("none", "slip", "dark30", "ids30", "moved")
 _FOUND = {  # row: name, factor, unit
@@ -43,8 +90,36 @@ _FOUND = {  # row: name, factor, unit
     "radius_percent": ("wheels.radius_scale", 100.0, "%"),
     "track_percent": ("wheels.track_scale", 100.0, "%"),
 }
+_PLAIN = {"motion": {"use": False}}  # a textbook knows no learned motion either
+_MAPS = {
+    "map.images.rms_mm": "mm",
+    "map.images.direction_deg": "deg",
+    "map.images.missing": "",
+    "map.fed_back.ate_mm": "mm",
+}
+_MAPPED = 3  # seeds of the validation split that are mapped
+_MODES = ("batch", "online")
+MRCLAM_IDS = (
+    "mrclam.first_pose_s",
+    *(f"mrclam.{mode}.{figure}" for mode in _MODES for figure in ("ate_mean_m", "nees_over_3")),
+    *(f"mrclam.robot{robot}.{mode}.nees_over_3" for robot in mrclam.ROBOTS for mode in _MODES),
+)
 _LEFT_OUT = "left out of a quick run"
 _Figure = Callable[[Scores], float | None]
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Cell:
+    """A case on a recording."""
+
+    take: Take
+    case: str
+    plain: bool = False  # without learned motion, online, and beside it the textbook's pipelines on the same steps
+
+    @property
+    def name(self) -> str:
+        """Name of the cell, for files and tables."""
+        return f"{self.case}{'_plain' if self.plain else ''}_{folder(self.take)}_{self.take.variant}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +138,7 @@ class Wanted:
 
 
 def measure(
-    quick: bool, split: Split = "test", prefixes: Sequence[str] = ("",), jobs: int | None = None
+    quick: bool, split: Split = "test", prefixes: Sequence[str] = ("",), jobs: int = os.cpu_count() or 1
 ) -> Iterator[Row]:
     """The rows whose ids begin with one of the prefixes; a quick run has one seed and two cases."""
     rows = [w for w in wanted() if w.id.startswith(tuple(prefixes))]
@@ -79,9 +154,9 @@ def measure(
         for w in rows:
             of_seeds = [found[cell] for cell in w.cells(split, seeds)] if w in todo else []
             yield w.row(w.id, of_seeds) if of_seeds else not_run([w.id], _LEFT_OUT)[0]
-    for name, part in (("map", installed_map.measure), ("mrclam", installed_mrclam.measure)):
-        if any(p.startswith(f"{name}.") or f"{name}.".startswith(p) for p in prefixes):
-            yield from (row for row in part(quick, split) if row.id.startswith(tuple(prefixes)))
+    for ids, part in ((tuple(_MAPS), maps(quick, split)), (MRCLAM_IDS, robots(quick, jobs))):
+        if any(row_id.startswith(tuple(prefixes)) for row_id in ids):
+            yield from (row for row in part if row.id.startswith(tuple(prefixes)))
 
 
 def wanted() -> Iterator[Wanted]:
@@ -184,10 +259,223 @@ def _values(row_id: str, scores: Sequence[Scores], figure: _Figure) -> tuple[lis
     return known, Row(row_id, None, n=len(scores), reason=f"in {len(missing)} of {len(scores)} runs: {why}")
 
 
+# --- Many cells -------------------------------------------------------------------------------------------------------
+
+
+def run_all(cells: Sequence[Cell], jobs: int) -> dict[Cell, Scores]:
+    """Scores of all cells, from the cache or run now; a process keeps to one recording."""
+    groups = [list(group) for _, group in groupby(sorted(cells), key=lambda cell: cell.take)]
+    found: dict[Cell, Scores] = {}
+    began = time.monotonic()
+    for done in parallel(_run_group, groups, jobs):
+        found.update(done)
+        gone = time.monotonic() - began
+        left = gone * (len(cells) / len(found) - 1.0)
+        print(f"{len(found)} of {len(cells)} cells, {gone:.0f} s, {left:.0f} s left", file=sys.stderr, flush=True)
+    return found
+
+
+def _run_group(cells: Sequence[Cell]) -> dict[Cell, Scores]:
+    return {cell: scores_of(cell) for cell in cells}
+
+
+def scores_of(cell: Cell) -> Scores:
+    """Scores of a cell, from the cache or run now."""
+    return Scores.from_json(kept(cell.name, lambda: run_cell(cell).as_json()))
+
+
+# --- One cell ---------------------------------------------------------------------------------------------------------
+
+
+def run_cell(cell: Cell) -> Scores:
+    """Scores of a case that is replayed now; of a failed run the reason."""
+    recorded = load(cell.take)
+    try:
+        chain = failures(cell.case, recorded)
+    except ValueError as error:  # a drive too short for the failure
+        return Scores(failed=str(error))
+    config = changed(recorded.config, _PLAIN if cell.plain else {})
+    batch_failed = ""
+    for batch in (False,) if cell.plain else (True, False):
+        with processor_times() as times:
+            try:
+                made = replayed(recorded, config, chain, cell.take.seed, batch)
+            except FglocError as error:
+                if not batch:
+                    return Scores(failed=f"{type(error).__name__}: {error}")
+                batch_failed = f"{type(error).__name__}: {error}"  # what was found online is scored all the same
+                continue
+        if made is None:
+            return Scores(failed="no pose was ever found")
+        return replace(_scores(recorded, config, made, times, cell.plain), batch_failed=batch_failed)
+    raise AssertionError("an online run ends the loop")
+
+
+def _scores(recorded: Recorded, config: Config, made: Replayed, times: Sequence[float], plain: bool) -> Scores:
+    unknown = made.unknown_ns(recorded.start_ns)
+    online, batch = made.online, made.batch
+    found = None if batch is None or recorded.installed is None else found_by(batch)
+    return Scores(
+        online=errors(online, config, unknown),
+        batch=None if batch is None else errors(batch, config, unknown),
+        lost_share=lost_share(online.modes, online.trajectory.stamps_ns, unknown),
+        refused_share=refused_share(online.decisions),
+        update_ms=tuple(round(ms, 4) for ms in times),
+        found=None if found is None else found_errors(found, recorded.installed or {}),
+        map_over_survey=None
+        if found is None
+        else map_over_survey(places_in(found), made.landmarks, recorded.installed or {}),
+        textbook_mm=textbook_mm(recorded, config, made) if plain else {},
+    )
+
+
+def textbook_mm(recorded: Recorded, config: Config, made: Replayed) -> dict[str, float]:
+    """Mean distance from the truth of each of the textbook's pipelines on the steps of a run [mm]."""
+    if recorded.camera is None or made.online.truth is None:
+        raise ValueError(f"{recorded.name}: the textbook needs a camera and a truth")
+    out = {}
+    for pipeline in PIPELINES:
+        estimates = Textbook(pipeline, made.landmarks, recorded.camera, config.wheels).run(made.steps)
+        stamps = np.array([e.stamp_ns for e in estimates], dtype=np.int64)
+        trajectory = Trajectory(stamps, np.array([e.pose for e in estimates]).reshape(-1, 3))
+        enough = len(estimates) > 1
+        out[pipeline] = 1e3 * float(match(trajectory, made.online.truth).distances.mean()) if enough else np.inf
+    return out
+
+
+# --- Maps -------------------------------------------------------------------------------------------------------------
+
+
+def maps(quick: bool, split: Split) -> Iterator[Row]:
+    """Rows of maps that are surveyed from images, then fed back; a quick run takes one seed."""
+    seeds = SEEDS[split] if split == "test" else SEEDS[split][:_MAPPED]
+    takes = [Take("tour", "unequal_radii", split, seed) for seed in (seeds[:1] if quick else seeds)]
+    try:
+        prepare(takes)
+    except RenderError as error:
+        yield from not_run(_MAPS, str(error))
+        return
+    found = [kept(f"map_{folder(take)}", lambda take=take: mapped(cache_folder() / folder(take))) for take in takes]  # type: ignore[misc]
+    failed = [f["failed"] for f in found if "failed" in f]
+    if failed:
+        yield from not_run(_MAPS, f"in {len(failed)} of {len(found)} runs: {failed[0]}")
+        return
+    for name, unit in _MAPS.items():
+        values = [float(f[name]) for f in found]
+        yield Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+
+
+def mapped(run_folder: Path) -> Mapping[str, float | str]:
+    """Survey a recording, and smooth it with the map."""
+    true = load_installed(run_folder / INSTALLED).map.landmark_map()
+    config = load_config(run_folder / "robot.yaml")
+    size = next(iter(true.landmarks.values())).size_m
+    markers = config.markers.model_copy(update={"dictionary": Markers().dictionary, "default_size_m": size})
+    try:
+        surveyed = survey([run_folder / "bag"], config.model_copy(update={"markers": markers})).landmarks
+        with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch) / "map.yaml"
+            write_map(surveyed, path)
+            ate_mm = _fed_back(run_folder / "bag", path, config)
+            return {**compared(load_map(path), true), "map.fed_back.ate_mm": ate_mm}
+    except FglocError as error:
+        return {"failed": f"{type(error).__name__}: {error}"}
+
+
+def compared(surveyed: LandmarkMap, true: LandmarkMap) -> dict[str, float]:
+    """Errors of a map after the rigid motion that fits the places best.
+
+    Source: Umeyama, IEEE PAMI 13(4), 1991, without scale.
+    """
+    ids = sorted(set(surveyed.landmarks) & set(true.landmarks))
+    a = np.array([true.landmarks[i].position for i in ids])
+    b = np.array([surveyed.landmarks[i].position for i in ids])
+    U, _, V = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    R = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V).T
+    off = (a - a.mean(axis=0)) - (b - b.mean(axis=0)) @ R.T
+    turned = [
+        Rotation.from_matrix(true.landmarks[i].rotation.T @ R @ surveyed.landmarks[i].rotation).magnitude() for i in ids
+    ]
+    return {
+        "map.images.rms_mm": 1e3 * math.sqrt(float((off**2).sum(axis=1).mean())),
+        "map.images.direction_deg": math.degrees(math.sqrt(float(np.square(turned).mean()))),
+        "map.images.missing": float(len(set(true.landmarks) - set(ids))),
+    }
+
+
+def _fed_back(bag: Path, map_path: Path, config: Config) -> float:
+    aligned = config.model_copy(update={"truth": config.truth.model_copy(update={"align": "se2"})})
+    matched = match_result(run(bag, map_path, config, "batch"), aligned)
+    if matched is None:
+        return math.nan
+    return 1e3 * float(matched.distances.mean())
+
+
+# --- Real robots ------------------------------------------------------------------------------------------------------
+
+
+def robots(quick: bool, jobs: int) -> Iterator[Row]:
+    """Rows of MRCLAM 6; a quick run takes one robot. There is one split: no robot's settings have seen its own run."""
+    if not MRCLAM.is_dir():
+        yield from not_run(MRCLAM_IDS, f"no {MRCLAM}; set FGLOC_REAL_DATA")
+        return
+    yield from robot_rows(dict(sorted(parallel(_robot, (3,) if quick else mrclam.ROBOTS, jobs))))
+
+
+def robot_rows(found: Mapping[int, Mapping[str, float]]) -> Iterator[Row]:
+    """Rows of the figures that `localized` gave for each robot."""
+    yield _robots("mrclam.first_pose_s", [f["first_pose_s"] for f in found.values()], "s")
+    for mode in _MODES:
+        yield _robots(f"mrclam.{mode}.ate_mean_m", [f[f"{mode}.ate_mean_m"] for f in found.values()], "m")
+        yield _robots(f"mrclam.{mode}.nees_over_3", [f[f"{mode}.nees_over_3"] for f in found.values()])
+    for robot in mrclam.ROBOTS:
+        for mode in _MODES:
+            name = f"mrclam.robot{robot}.{mode}.nees_over_3"
+            if robot in found:
+                yield Row(name, found[robot][f"{mode}.nees_over_3"])
+            else:
+                yield from not_run([name], _LEFT_OUT)
+
+
+def _robots(row_id: str, values: Sequence[float], unit: str = "") -> Row:
+    return Row(row_id, float(np.mean(values)), float(np.std(values)), len(values), unit)
+
+
+def _robot(robot: int) -> tuple[int, Mapping[str, Any]]:
+    return robot, kept(f"mrclam_robot{robot}", lambda: localized(robot))
+
+
+def localized(robot: int) -> dict[str, float]:
+    """Figures of one robot, online and smoothed from the same replay."""
+    with tempfile.TemporaryDirectory() as scratch:
+        bag, map_path, config = converted(robot, Path(scratch))
+        estimates: list[Estimate] = []
+        moved_ns: list[int] = []
+
+        def note(step: Step, estimate: Estimate | None) -> None:
+            if not moved_ns:
+                moved_ns.extend(c.stamp_ns for c in step.controls if c.v or c.omega)
+            if estimate is not None:
+                estimates.append(estimate)
+
+        smoothed = run(bag, map_path, config, "batch", on_step=note)
+    trajectory = Trajectory(
+        np.array([e.stamp_ns for e in estimates], dtype=np.int64),
+        np.array([e.pose for e in estimates]),
+        np.array([e.cov for e in estimates]),
+    )
+    told = {"online": replace(smoothed, trajectory=trajectory), "batch": smoothed}
+    out = {"first_pose_s": max(estimates[0].stamp_ns - moved_ns[0], 0) * 1e-9}
+    for mode, result in told.items():
+        found = errors(result, config)
+        out |= {f"{mode}.ate_mean_m": 1e-3 * found.ate_mm, f"{mode}.nees_over_3": found.nees_over_3}
+    return out
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--rows", default="", help="comma-separated beginnings of ids")
-    parser.add_argument("--jobs", type=int, default=None, help="processes")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     known, rest = parser.parse_known_args()
     main(lambda quick: measure(quick, known.split, tuple(known.rows.split(",")), known.jobs), __doc__ or "", rest)

@@ -32,14 +32,11 @@ import numpy as np
 import yaml
 from scipy.special import betaincinv
 
-from benchmarks.adaptive_runs import CASES as FAILURES
-from benchmarks.adaptive_runs import failure, replayed
 from benchmarks.common import Row, main, not_run
-from benchmarks.field_recordings import DATA, RECORDINGS
-from benchmarks.installed_recordings import SEEDS, Take, load, prepare
-from benchmarks.installed_runs import CASES, floor
-from benchmarks.installed_scores import carried
-from fgloc.ablation.failures import Kidnap, Lift
+from benchmarks.field_recordings import RECORDINGS
+from benchmarks.installed import CASES
+from benchmarks.recordings import DATA, SEEDS, Take, load, prepare
+from benchmarks.replays import failures, floor, replayed
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file
 from fgloc.errors import FglocError
@@ -118,7 +115,6 @@ def held(result: RunResult, config: Config, unknown_ns: tuple[int, int] | None =
 def simulated(case: str, seed: int) -> Held | None:
     """A case on a recording; None if no pose was ever found."""
     recorded = load(Take("installed", floor(case), "test", seed))
-    chain = [failure(described) for described in FAILURES[case].chain(recorded)]
     bounds, spent = ProtectionLevels.of, [0.0]
 
     def timed(*given: Any) -> Protection:
@@ -128,12 +124,11 @@ def simulated(case: str, seed: int) -> Held | None:
         return made
 
     with mock.patch.object(ProtectionLevels, "of", timed):
-        made = replayed(recorded, recorded.config, chain, seed, batch=False)
+        made = replayed(recorded, recorded.config, failures(case, recorded), seed, batch=False)
     if made is None:
         return None
     whole = 1e-3 * float(made.online.step_ms.sum())
-    lifted = [f.when.intervals[0][0] for f in chain if isinstance(f, Kidnap | Lift)]
-    unknown = carried(made.given, recorded.start_ns + round(lifted[0] * 1e9)) if lifted else None
+    unknown = made.unknown_ns(recorded.start_ns)
     return replace(held(made.online, recorded.config, unknown), step_over_none=whole / (whole - spent[0]))
 
 

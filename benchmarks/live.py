@@ -23,10 +23,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import live_endurance, live_resume
-from benchmarks.adaptive_recordings import Recorded
 from benchmarks.common import Row, main
-from benchmarks.installed_recordings import SEEDS, Take, load, prepare
 from benchmarks.live_streams import disordered, roles_of, truth_of
+from benchmarks.recordings import SEEDS, Recorded, Take, load, prepare
 from fgloc import se2
 from fgloc.config import load_config
 from fgloc.frames import quaternion_yaw

@@ -18,9 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.adaptive_recordings import Recorded
 from benchmarks.common import Row, main
-from benchmarks.installed_recordings import SEEDS, Take, load, prepare
 from benchmarks.live_streams import (
     SIGHTINGS_HZ,
     circle,
@@ -29,6 +27,7 @@ from benchmarks.live_streams import (
     mirrored,
     wrong_ids,
 )
+from benchmarks.recordings import SEEDS, Recorded, Take, load, prepare
 from fgloc.config import Config, Role
 from fgloc.live.run import LiveFacts, OnlineRun
 from fgloc.sensors.markers.images import CornersEvent

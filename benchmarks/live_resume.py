@@ -19,10 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.adaptive_recordings import Recorded
 from benchmarks.common import Row, main
-from benchmarks.installed_recordings import SEEDS, Take, load, prepare
 from benchmarks.live_streams import roles_of, truth_of
+from benchmarks.recordings import SEEDS, Recorded, Take, load, prepare
 from fgloc import se2
 from fgloc.live import Live
 from fgloc.types import Estimate, FloatArray, Mode

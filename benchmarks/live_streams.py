@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from benchmarks.adaptive_recordings import Recorded
+from benchmarks.recordings import Recorded
 from fgloc import se2
 from fgloc.config import Config, config_of
 from fgloc.frames import yaw_quaternion

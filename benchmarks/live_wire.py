@@ -12,7 +12,6 @@ The bundled recordings, at their own speed. A third process, this one, subscribe
 - ``live.busy_*``: the same with two other processes that compute without end.
 - ``live.load``: processes of this machine that ran or wanted to run, mean over the last minute of the unhurried runs:
   more than the machine's cores disturb all of these figures.
-- ``live.interop``: as `benchmarks.live_interop` has it.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import live_interop
 from benchmarks.common import Row, main
 from fgloc.config import load_config
 from fgloc.live.wire.participant import Participant, Sample
@@ -179,7 +177,6 @@ def measure(quick: bool) -> Iterator[Row]:
     yield Row("live.load", load)
     with _busy(_OTHERS):
         yield from timing("live.busy_", [live_run(_SAMPLES / names[-1], 100 + (os.getpid() + len(names)) % 100, rate)])
-    yield from live_interop.measure(quick)
 
 
 def timing(prefix: str, runs: Sequence[Heard]) -> Iterator[Row]:

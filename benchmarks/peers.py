@@ -29,12 +29,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import peers_mrclam
-from benchmarks.adaptive_recordings import Recorded, Split
-from benchmarks.adaptive_runs import CASES as FAILURES
-from benchmarks.adaptive_runs import Replayed, changed, failure, replayed
 from benchmarks.common import Row, main, not_run
-from benchmarks.installed_recordings import SEEDS, Take, load, prepare
-from benchmarks.installed_runs import floor, kept, processor_times
+from benchmarks.recordings import SEEDS, Recorded, Split, Take, changed, load, prepare
+from benchmarks.replays import Replayed, failures, floor, kept, processor_times, replayed
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
 from fgloc.ablation.failures import corrupt, generators
@@ -160,7 +157,7 @@ def _scores_of(runs: Runs, steps: Sequence[Step], truth: Trajectory) -> dict[str
 def replay(case: str, split: Split, seed: int) -> tuple[Recorded, Replayed, float]:
     """Fgloc's online run of a case: recording, what came of it, mean processor time of an update [ms]."""
     recorded = load(Take("installed", floor(case), split, seed))
-    chain = [failure(described) for described in FAILURES[case].chain(recorded)]
+    chain = failures(case, recorded)
     with processor_times() as times:
         made = replayed(recorded, changed(recorded.config, {}), chain, seed, False)
     if made is None or made.online.truth is None:
@@ -255,7 +252,7 @@ def export(out: Path, quick: bool, split: Split, seeds: int | None) -> None:
 
 
 def _export(recorded: Recorded, case: str, seed: int, out: Path) -> None:
-    chain = [failure(described) for described in FAILURES[case].chain(recorded)]
+    chain = failures(case, recorded)
     ids = tuple(sorted(recorded.landmarks.landmarks))
     scenes = [
         Scene(recorded.start_ns, recorded.duration_s, recorded.config, ids, rng) for rng in generators(len(chain), seed)

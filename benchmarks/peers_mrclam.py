@@ -20,20 +20,16 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from benchmarks.adaptive_runs import changed
-from benchmarks.installed_mrclam import DATA, MODELS
+from benchmarks.recordings import converted
 from fgloc import se2
 from fgloc.ablation.jobs import start_at_truth
-from fgloc.config import Config, load_config
-from fgloc.recording.storage import find_beside
+from fgloc.config import Config
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Estimate, FloatArray, LandmarkMap, Step, Trajectory
-from fgloc_datasets import mrclam
 
-SOURCE = DATA / "mrclam6"
 _START = np.array([0.1, 0.1, 0.1])  # m, m, rad
 _HELD_M = 1e-3  # of a landmark
 _LANDMARKS = 1_000_000_000  # keys of landmarks are above those of poses
@@ -71,12 +67,8 @@ def replay(robot: int) -> Replay:
         estimates.extend([] if estimate is None else [estimate])
 
     with tempfile.TemporaryDirectory() as scratch:
-        bag = mrclam.convert(SOURCE, robot, Path(scratch) / "robot")
-        robot_yaml, map_yaml = find_beside(bag, "robot.yaml"), find_beside(bag, "map.yaml")
-        assert robot_yaml is not None
-        assert map_yaml is not None
-        model = {"motion": {"model": MODELS / f"without_robot{robot}.safetensors"}}
-        config = start_at_truth(bag, changed(load_config(robot_yaml), model))
+        bag, map_yaml, config = converted(robot, Path(scratch))
+        config = start_at_truth(bag, config)
         truth = run(bag, map_yaml, config, "online", on_step=note).truth
         landmarks = load_map(map_yaml)
     assert truth is not None

@@ -8,15 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from event_makers import corners
 
-from benchmarks import installed, installed_mrclam, installed_runs
-from benchmarks.installed_recordings import SEEDS, Take, folder
-from benchmarks.installed_runs import CASES, Cell, floor
-from benchmarks.installed_scores import (
+from benchmarks import installed
+from benchmarks.installed import CASES, Cell
+from benchmarks.recordings import Take
+from benchmarks.replays import floor
+from benchmarks.scores import (
     Errors,
     Scores,
-    carried,
     errors,
     found_errors,
     inside,
@@ -98,13 +97,6 @@ def test_a_run_without_truth_cannot_be_scored():
         errors(replace(result(np.zeros((3, 3))), truth=None), Config())
 
 
-def test_nothing_is_known_from_the_lift_to_the_first_marker():
-    seen = [corners(t) for t in (9.0, 14.0, 15.0)]
-    empty = replace(corners(12.0), sightings=())
-    assert carried([*seen, empty], 10 * SECOND) == (10 * SECOND, 14 * SECOND)
-    assert carried(seen[:1], 10 * SECOND)[1] > 10**18
-
-
 def test_a_robot_that_was_carried_away_may_be_lost_until_a_second_after_it_sees():
     stamps = np.arange(8) * SECOND
     modes = [Mode.OK, Mode.LOST, Mode.LOST, Mode.LOST, Mode.LOST, Mode.LOST, Mode.DEAD_RECKONING, Mode.OK]
@@ -157,20 +149,6 @@ def test_scores_come_back_from_json_as_they_were():
     assert math.isnan(none.lost_share)
 
 
-def test_cells_are_made_once_and_anew_when_a_source_changes(tmp_path, monkeypatch):
-    monkeypatch.setenv("FGLOC_BENCHMARK_CACHE", str(tmp_path))
-    made = []
-
-    def make():
-        made.append(1)
-        return scores(ate=float(len(made))).as_json()
-
-    assert Scores.from_json(installed_runs.kept("cell", make)) == scores(ate=1.0)
-    assert Scores.from_json(installed_runs.kept("cell", make)) == scores(ate=1.0)
-    monkeypatch.setattr(installed_runs, "_sources", lambda: "other")
-    assert Scores.from_json(installed_runs.kept("cell", make)) == scores(ate=2.0)
-
-
 def row(row_id, found):
     wanted = next(w for w in installed.wanted() if w.id == row_id)
     return wanted.row(row_id, found)
@@ -207,13 +185,10 @@ def test_the_best_pipeline_of_the_textbook_is_that_with_the_least_mean():
     assert (made.value, made.spread, made.n) == (3.0, 1.0, 2)
 
 
-def test_ids_are_unique_and_splits_share_no_seed():
+def test_ids_are_unique_and_cells_are_ordered_by_recording():
     ids = [w.id for w in installed.wanted()]
     assert len(ids) == len(set(ids))
     assert {f"{case}.online.nees_over_3" for case in CASES} < set(ids)
-    assert not set(SEEDS["test"]) & set(SEEDS["validation"])
-    takes = {Take(v, "patches", "validation", 41) for v in ("installed", "map5mm", "perfect", "found")}
-    assert len({folder(take) for take in takes}) == 4
     assert floor("dark60") == "patches"
     assert Cell(Take("found", "patches", "test", 61), "none") < Cell(Take("perfect", "patches", "test", 61), "none")
 
@@ -222,8 +197,8 @@ def test_mrclam_rows_are_means_over_the_robots():
     figures = {"first_pose_s": 1.0, "batch.ate_mean_m": 0.1, "online.ate_mean_m": 0.2}
     figures |= {"batch.nees_over_3": 1.0, "online.nees_over_3": 1.2}
     more = {name: 3.0 * value for name, value in figures.items()}
-    made = {r.id: r for r in installed_mrclam.rows({1: figures, 3: more})}
-    assert set(made) == set(installed_mrclam.IDS)
+    made = {r.id: r for r in installed.robot_rows({1: figures, 3: more})}
+    assert set(made) == set(installed.MRCLAM_IDS)
     assert made["mrclam.first_pose_s"].value == 2.0
     assert made["mrclam.online.ate_mean_m"].value == pytest.approx(0.4)
     assert made["mrclam.robot3.batch.nees_over_3"].value == 3.0

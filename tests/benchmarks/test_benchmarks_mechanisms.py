@@ -4,30 +4,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from exact import exact
 from robot_world import Chain, World, room
 
-import fgloc
 from benchmarks import mechanisms
 from benchmarks.common import Row
-from benchmarks.installed_scores import Errors
-from benchmarks.mechanisms_cells import Cell, Outcome
-from benchmarks.mechanisms_effect import changes, outside, ratio
-from benchmarks.mechanisms_off import BY_NAME, MECHANISMS
-from benchmarks.mechanisms_report import report, without_effect
-from benchmarks.mechanisms_rows import Scope, over_before, wanted
-from benchmarks.mechanisms_runs import file_name, named, outcome
-from benchmarks.mechanisms_switch import Mechanism, Probe, Returns, Switch, probes_signature, watched
+from benchmarks.mechanisms import (
+    Cell,
+    Outcome,
+    Scope,
+    changes,
+    file_name,
+    mechanism_of,
+    outcome,
+    outside,
+    ratio,
+    report,
+    wanted,
+    without_effect,
+)
+from benchmarks.mechanisms_off import BY_NAME, MECHANISMS, Returns, Switch, watched
+from benchmarks.scores import Errors
 from fgloc.estimation import place as place_search
 from fgloc.estimation import sightings as association
 from fgloc.estimation.sightings import Association
 from fgloc.types import LandmarkMap
-
-PACKAGE = Path(fgloc.__file__).parent
 
 
 def moved_world(seconds=12.0):
@@ -50,7 +54,7 @@ def result(ate=1.0, nees=1.0, batch=None, **changes_):
 
 
 def scope(*names):
-    return Scope("validation", (41, 42), (), ("none", "slip", "kidnap"), tuple(BY_NAME[n] for n in names))
+    return Scope("validation", (41, 42), (41,), (), ("none", "slip", "kidnap"), tuple(BY_NAME[n] for n in names))
 
 
 def found_in(chosen, on, off):
@@ -68,12 +72,10 @@ def test_each_switch_replaces_what_is_there_and_puts_it_back(mechanism):
     assert [vars(holder).get(name) for holder, name in places] == before
 
 
-def test_names_are_unique_and_modules_exist():
+def test_names_are_unique_and_cases_exist():
     assert len(BY_NAME) == len(MECHANISMS)
-    known = {path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py")}
-    for mechanism in MECHANISMS:
-        assert set(mechanism.modules) <= known, mechanism.name
-        assert mechanism.purpose.endswith(".")
+    robots = {f"robot_{case}" for case in mechanisms.ROBOT_CASES}
+    assert {mechanism.case for mechanism in MECHANISMS} <= {*mechanisms.CASES, *robots}
 
 
 def test_probes_watch_what_is_there_and_put_it_back():
@@ -108,21 +110,6 @@ def test_what_is_returned_may_be_changed_by_the_caller():
     assert empty() == []
 
 
-def test_signatures_follow_what_a_switch_does():
-    def one(real):
-        return lambda: 1
-
-    def two(real):
-        return lambda: 2
-
-    def made(off, acts=bool):
-        return Mechanism("a", "b.", (), (Switch("m:f", off),), Probe("m:f", acts))
-
-    assert made(one).signature == made(one).signature != made(two).signature
-    assert made(Returns(1)).signature != made(Returns(2)).signature
-    assert probes_signature([made(one)]) != probes_signature([made(one, lambda result, *_: not result)])
-
-
 def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
     on = result(acted={"misread_ids": 0, "doubtful_wheels": 3})
     asked = []
@@ -131,22 +118,20 @@ def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
         asked.append(name)
         return asdict(on if "_on_" in name else result(2.0))
 
-    monkeypatch.setattr("benchmarks.mechanisms_runs.kept", kept)
+    monkeypatch.setattr("benchmarks.mechanisms.kept", kept)
     assert outcome(Cell(3, "none", "misread_ids")) == on
     assert outcome(Cell(3, "none", "doubtful_wheels")).online.ate_mm == 2.0
     assert outcome(Cell(3, "none", "gate")).online.ate_mm == 2.0
-    assert sum("_off_" in name for name in asked) == 2
+    assert sum("_on_" not in name for name in asked) == 2
     assert file_name(Cell(3, "none", "gate")) != file_name(Cell(3, "none", "doubtful_wheels"))
 
 
 def test_several_at_once_are_all_off_and_have_one_file():
-    both = named("gate+start_trimming")
+    both = mechanism_of("gate+start_trimming")
     with both.off():
         assert place_search.MOST_STEPS == 0
         assert association.chi2_bound(0.99, 2) == math.inf
-    name = file_name(Cell(3, "none", both.name))
-    assert "together" in name
-    assert name != file_name(Cell(3, "none", "gate+misread_ids"))
+    assert file_name(Cell(3, "none", both.name)) != file_name(Cell(3, "none", "gate+misread_ids"))
 
 
 def test_a_change_counts_where_it_is_large_enough():
@@ -177,10 +162,6 @@ def test_rows_are_ratios_of_means_and_those_without_value_say_why():
     row = ratio("a", [Outcome(failed="lost"), result()], on, "online", "ate_mm")
     assert row.value is None
     assert "lost" in row.reason
-    assert over_before("b", Row("none.online.ate_mm", 3.0, 1.0, 2), {"none.online.ate_mm": 2.0}) == Row(
-        "b", 1.5, 0.5, 2
-    )
-    assert over_before("b", Row("none.online.ate_mm", 3.0), {}).value is None
 
 
 def test_the_table_is_well_formed_and_names_what_has_no_effect():
@@ -231,9 +212,7 @@ def test_the_command_line_chooses_split_seeds_and_rows():
     assert options.wants("motion.delay_s")
     assert not options.wants("off.gate_keeper.none")
     assert mechanisms.scope(False, options).seeds == (41, 42, 43)
-    assert mechanisms.scope(False, replace(options, seeds=2)).seeds == (41, 42)
-    assert mechanisms.parsed(["--together", "gate,doubtful_wheels"])[0].together == ("gate", "doubtful_wheels")
-    with pytest.raises(SystemExit):
-        mechanisms.parsed(["--together", "gates"])
+    assert mechanisms.scope(False, options).off_seeds == (41, 42)
+    assert mechanisms.scope(False, replace(options, seeds=10)).off_seeds == (41, 42, 43)
     quick = mechanisms.scope(True, options)
     assert (quick.seeds, quick.cases) == ((41,), mechanisms.QUICK_CASES)

@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 from source_roots import PYTHONPATH
 
-from benchmarks.equal_cases import Drive
-from benchmarks.example_sensors import example_sensors
-from benchmarks.sensors import only
+from benchmarks.equal_cases import Drive, example_sensors
 from fgloc import se2
 from fgloc.config import Config, GateConfig, config_of, load_config
 from fgloc.errors import ConfigError
@@ -67,6 +65,13 @@ def recording(folders, tmp_path_factory):
     folder = tmp_path_factory.mktemp("radio")
     record(scenario, 4, folder)
     return folder
+
+
+def only(config, used):
+    """The configuration with one of the two sensors."""
+    off = {name: "none" for name in ("uwb", "gnss") if name != used}
+    topics = config.recording.topics.model_copy(update=off)
+    return config.model_copy(update={"recording": config.recording.model_copy(update={"topics": topics})})
 
 
 def context(section, landmark_map=None, frame=lambda name: None):
@@ -295,7 +300,7 @@ def test_events_get_a_keyframe_of_their_own_if_their_stream_says_so(uwb, keyfram
 @pytest.mark.parametrize(("sensor", "bound_m"), [pytest.param("uwb", 0.08, marks=pytest.mark.slow), ("gnss", 0.03)])
 def test_the_pose_is_found_and_held_by_one_sensor_alone(recording, sensor, bound_m):
     """No map, no first pose, no camera."""
-    config = only(load_config(recording / "robot.yaml"), [sensor])
+    config = only(load_config(recording / "robot.yaml"), sensor)
     result = run(recording / "bag", None, config, "batch", check=False)
     metrics = compute_metrics(result, config)
     assert metrics.ate_rmse_m < bound_m
@@ -448,7 +453,7 @@ def test_the_gyros_bias_is_learned_from_positions_far_apart_only(recording, monk
         taught.append((gyro.bias != before[0], before[1], apart_s))
 
     monkeypatch.setattr(Gyro, "fix", spied)
-    config = only(load_config(recording / "robot.yaml"), ["gnss"])
+    config = only(load_config(recording / "robot.yaml"), "gnss")
     result = run(recording / "bag", None, config, "online", check=False)
     assert result.counts["gnss"] > 40
     learned = [(turned_s, apart_s) for changed, turned_s, apart_s in taught if changed]

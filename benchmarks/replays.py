@@ -1,29 +1,36 @@
-"""One cell of the benchmark of adaptive weights: a failure on a floor, replayed for some seeds with some configuration.
-
-    >>> from benchmarks.adaptive_runs import cell
-    >>> cell("slip", (22, 23), {"weights": {"window_s": 1.0}}, split="validation")  # doctest: +SKIP
+"""Replays that benchmarks share: a recording with a failure through fgloc, and figures of it that are kept as JSON.
 
 Failures are those of `fgloc.ablation.failures`; what is random in them is drawn anew for each seed. Online and batch
-come from the same replay.
+come from the same replay. What is kept is named by the hash of fgloc's sources and of those that score, and by the
+recording: an interrupted benchmark goes on where it was, and a change of either is measured anew.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from pydantic import TypeAdapter
 
-from benchmarks.adaptive_recordings import Floor, Recorded, Split, load, moved_interval, slip_intervals
-from benchmarks.adaptive_scores import Figures, lost, score
-from fgloc.ablation.failures import AnyFailure, corrupt, generators
-from fgloc.config import Config, config_of
+from benchmarks.recordings import ROOT, Floor, Recorded, cache_folder, moved_interval
+from fgloc.ablation.failures import AnyFailure, Kidnap, Lift, corrupt, generators
+from fgloc.config import Config
 from fgloc.errors import EstimatorError
+from fgloc.estimation.localizer import Localizer
+from fgloc.files.atomic import atomic_file
 from fgloc.runner import RunResult, protections, run
 from fgloc.sensors.failures import Failure, Scene
 from fgloc.sensors.maps import write_map
@@ -31,13 +38,12 @@ from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.types import Estimate, Event, LandmarkMap, Step, Trajectory
 
-Changes = Mapping[str, Any]
 Interval = tuple[float, float]
-
 FAILED_S = (30.0, 50.0)  # when encoders fail
 KIDNAPPED_S, KIDNAPPED_M = 30.0, (3.0, 2.5, 2.0, 1.5, 1.0)  # the farthest that the drive allows
 MOVED_M = 0.5
 _FAILURE = TypeAdapter(AnyFailure)
+_SCORING = ("installed", "recordings", "replays", "scores", "textbook")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,15 +52,12 @@ class Case:
 
     floor: Floor
     chain: Callable[[Recorded], list[dict[str, Any]]] = lambda recorded: []
-    wheels_wrong: Callable[[Recorded], list[Interval]] | None = (
-        None  # when wheels fail, for the oracle [s]; None: not known
-    )
 
 
 def _dark(length_s: float) -> Case:
     start = 0.5 * (80.0 - length_s)
     failure = {"kind": "dropout", "sensor": "camera", "when": {"intervals": [(start, start + length_s)]}}
-    return Case("patches", lambda recorded: [failure], slip_intervals)
+    return Case("patches", lambda recorded: [failure])
 
 
 def _wrong_ids(share: float) -> Case:
@@ -62,14 +65,20 @@ def _wrong_ids(share: float) -> Case:
 
 
 def _encoders(failure: dict[str, Any]) -> Case:
-    told = failure | {"when": {"intervals": [FAILED_S]}}
-    return Case("unequal_radii", lambda recorded: [told], lambda recorded: [(FAILED_S[0], FAILED_S[1] + 0.2)])
+    return Case("unequal_radii", lambda recorded: [failure | {"when": {"intervals": [FAILED_S]}}])
 
 
-CASES: dict[str, Case] = {
+def _carried(kind: str) -> Case:
+    def chain(recorded: Recorded) -> list[dict[str, Any]]:
+        return [{"kind": kind, "when": {"intervals": [carried_interval(recorded)]}}]
+
+    return Case("unequal_radii", chain)
+
+
+FAILURES: dict[str, Case] = {
     "none": Case("unequal_radii"),
-    "slip": Case("patches", wheels_wrong=slip_intervals),
-    "mu01": Case("slippery", wheels_wrong=slip_intervals),
+    "slip": Case("patches"),
+    "mu01": Case("slippery"),
     "dark30": _dark(30.0),
     "dark60": _dark(60.0),
     "ids10": _wrong_ids(0.1),
@@ -81,46 +90,14 @@ CASES: dict[str, Case] = {
     ),
     "frozen": _encoders({"kind": "encoder_frozen"}),
     "onewheel": _encoders({"kind": "encoder_dead", "wheel": "left"}),
-    "kidnap": Case(
-        "unequal_radii",
-        lambda recorded: [{"kind": "kidnap", "when": {"intervals": [carried_interval(recorded)]}}],
-    ),
-    "lifted": Case(
-        "unequal_radii",
-        lambda recorded: [{"kind": "lift", "when": {"intervals": [carried_interval(recorded)]}}],
-    ),
+    "kidnap": _carried("kidnap"),
+    "lifted": _carried("lift"),
 }
 
 
-def cell(
-    name: str,
-    seeds: Iterable[int],
-    changes: Changes | None = None,
-    *,
-    oracle: bool = False,
-    batch: bool = False,
-    split: Split = "test",
-) -> list[Figures]:
-    """Replay a case for each seed.
-
-    Args:
-        name: of `CASES`.
-        seeds: of the split's recordings.
-        changes: of the configuration, as nested mappings.
-        oracle: give the weights the times when the wheels are wrong.
-        batch: smooth as well.
-        split: of the simulated suite.
-    """
-    case = CASES[name]
-    out = []
-    for seed in seeds:
-        recorded = load(case.floor, split, seed)
-        chain = [failure(described) for described in case.chain(recorded)]
-        config = changed(recorded.config, changes or {})
-        if oracle and case.wheels_wrong is not None:
-            config = changed(config, distrusting(case.wheels_wrong(recorded)))
-        out.append(replay(recorded, config, chain, seed, batch))
-    return out
+def floor(case: str) -> Floor:
+    """Floor on which a case is driven."""
+    return FAILURES[case].floor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,15 +120,17 @@ class Replayed:
     steps: Sequence[Step]
     landmarks: LandmarkMap
 
+    def unknown_ns(self, start_ns: int) -> tuple[int, int] | None:
+        """Stamps [ns] from the first lift to the first image after it that shows a marker; None if nothing lifts it.
 
-def replay(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: int, batch: bool) -> Figures:
-    """Figures of one run of a recording with failures.
-
-    Raises:
-        FglocError: the configuration does not fit the recording.
-    """
-    made = replayed(recorded, config, chain, seed, batch)
-    return lost(seed) if made is None else score(recorded, seed, config, made.online, made.batch, chain, made.given)
+        ``start_ns`` is the recording's. In this time the pose cannot be known.
+        """
+        lifts_s = [f.when.intervals[0][0] for f in self.chain if isinstance(f, Kidnap | Lift)]
+        if not lifts_s:
+            return None
+        lifted_ns = start_ns + round(lifts_s[0] * 1e9)
+        seen = [e.stamp_ns for e in self.given if isinstance(e, CornersEvent) and e.sightings]
+        return lifted_ns, min((stamp for stamp in seen if stamp > lifted_ns), default=2**62)
 
 
 def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed: int, batch: bool) -> Replayed | None:
@@ -215,21 +194,16 @@ def _trajectory(estimates: Sequence[Estimate]) -> Trajectory:
     )
 
 
-def changed(config: Config, changes: Changes) -> Config:
-    """The configuration with some of its values replaced."""
+def failures(case: str, recorded: Recorded) -> list[Failure]:
+    """Failures of a case of `FAILURES` on a recording.
 
-    def merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-        return {**old, **{k: merged(old[k], v) if isinstance(v, Mapping) else v for k, v in new.items()}}
-
-    return config_of(merged(config.model_dump(), changes))
-
-
-def distrusting(intervals: Sequence[Interval]) -> dict[str, Any]:
-    """Configuration with the times when the wheels are wrong."""
-    return {"weights": {"distrust": [{"source": "wheels", "start_s": a, "end_s": b} for a, b in intervals]}}
+    Raises:
+        ValueError: the drive is too short for them.
+    """
+    return [failure(described) for described in FAILURES[case].chain(recorded)]
 
 
-def failure(described: dict[str, Any]) -> Failure:
+def failure(described: Mapping[str, Any]) -> Failure:
     """A failure as a suite of ablations describes it."""
     return _FAILURE.validate_python(described)
 
@@ -253,3 +227,64 @@ def moved_id(recorded: Recorded) -> int:
     seen = [i for i in seen if i in recorded.landmarks]
     ids, counts = np.unique(seen, return_counts=True)
     return int(ids[int(np.argmax(counts))])
+
+
+# --- Figures that are kept --------------------------------------------------------------------------------------------
+
+
+def kept(name: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Result of a cell: from the cache, or made now and put there."""
+    path = cache_folder() / "installed" / f"{name}_{_sources()}.json"
+    if path.is_file():
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    began = time.monotonic()
+    content = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as file:
+        json.dump(content, file)
+    print(
+        f"  {name}: {time.monotonic() - began:.1f} s {content.get('failed') or content.get('batch_failed') or ''}",
+        file=sys.stderr,
+        flush=True,
+    )
+    return content
+
+
+@cache
+def _sources() -> str:
+    made = hashlib.sha256()
+    package = sorted(p for p in (ROOT / "fgloc").rglob("*") if p.suffix in (".py", ".safetensors"))
+    for path in [*package, *(ROOT / "benchmarks" / f"{name}.py" for name in _SCORING)]:
+        made.update(path.relative_to(ROOT).as_posix().encode())
+        made.update(path.read_bytes())
+    return made.hexdigest()[:12]
+
+
+def parallel(work: Callable[[Any], Any], items: Sequence[Any], jobs: int) -> Iterator[Any]:
+    """Results of the work for the items, in any order; computed in this process if there is one job."""
+    if jobs == 1 or len(items) < 2:
+        yield from map(work, items)
+        return
+    with ProcessPoolExecutor(min(jobs, len(items)), get_context("spawn")) as pool:
+        for job in as_completed([pool.submit(work, item) for item in items]):
+            yield job.result()
+
+
+@contextmanager
+def processor_times() -> Iterator[list[float]]:
+    """Processor time [ms] of every update after the one that gave the first pose, while this holds."""
+    times: list[float] = []
+    started = False
+    update = Localizer.update
+
+    def timed(self: Localizer, step: Step) -> Estimate | None:
+        nonlocal started
+        began = time.process_time()
+        estimate = update(self, step)
+        if started:
+            times.append((time.process_time() - began) * 1e3)
+        started = started or estimate is not None
+        return estimate
+
+    with patch.object(Localizer, "update", timed):
+        yield times

@@ -1,17 +1,20 @@
-"""Recordings for the benchmark of adaptive weights: simulated and searched for markers once, then kept.
+"""Recordings that benchmarks share: simulated and searched for markers once, then kept; and robots of MRCLAM 6.
 
-They lie in ``FGLOC_BENCHMARK_CACHE`` (default: ``fgloc/benchmarks`` in the user's cache), in folders named by the hash
-of scenario, seed and versions; what was detected is named by the hash of the detector. After a change of the
-simulator's code remove the folder. Floors are those of the simulated suite with the control functions of the split, and
-everything is exactly as written; test and validation use seeds of their own, which neither the suite's training nor the
-tuning of any setting has seen.
+Simulated ones lie in ``FGLOC_BENCHMARK_CACHE`` (default: ``fgloc/benchmarks`` in the user's cache), in folders named by
+the hash of scenario, seed and versions; what was detected is named by the hash of the detector. After a change of the
+simulator's code remove the folder. Floors are those of the simulated suite with the control functions of the split;
+seeds are such as no training and no setting has seen. In an ``installed`` recording every error of a careful
+installation is drawn by the seed (`fgloc_datasets.sim.scenario`), and the floor's own error of the wheels is left out;
+``map5mm`` errs in the places of the markers only; ``perfect`` in nothing. ``found`` is ``installed`` with a longer
+drive, ``tour`` with one of three minutes around a room of 6 m.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -23,32 +26,51 @@ import yaml
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from fgloc.config import Config, MarkersConfig, config_of
+from fgloc.config import Config, MarkersConfig, config_of, load_config
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.recording.reader import Recording, open_recording
+from fgloc.recording.storage import find_beside
 from fgloc.sensors.cameras import camera_from_info
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners
 from fgloc.types import Camera, CameraInfoEvent, Event, FloatArray, LandmarkMap, TruthEvent
+from fgloc_datasets import mrclam
 from fgloc_datasets.sim.record import BUNDLED, Job, describe, is_recorded, load_suite, record_suite, robot_settings
-from fgloc_datasets.sim.scenario import Scenario
+from fgloc_datasets.sim.scenario import Control, Installation, Markers, Scenario, World
 
-Split = Literal["train", "validation", "test"]
+Split = Literal["validation", "test"]
 Floor = Literal["unequal_radii", "patches", "slippery"]
-Change = Callable[[Scenario], Scenario]
-"""Of a floor's scenario, by another benchmark: a function of a module, so that recordings can be distinguished."""
-SEEDS: dict[Split, tuple[int, ...]] = {
-    "train": (13, 14),
-    "validation": (22, 23, 24),
-    "test": (31, 32, 33, 34, 35),
-}
-DURATION_S = 80.0
-_ROOT = Path(__file__).resolve().parent.parent
+Variant = Literal["installed", "map5mm", "perfect", "found", "tour"]
+SEEDS: dict[Split, tuple[int, ...]] = {"validation": tuple(range(41, 46)), "test": tuple(range(61, 71))}
+ROOT = Path(__file__).resolve().parent.parent
+DATA = Path(os.environ.get("FGLOC_REAL_DATA", ROOT.parent / "shared" / "data"))
+"""Folder of recordings that others made."""
+MRCLAM = DATA / "mrclam6"
+MODELS = ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
+_DURATION_S, _FOUND_S, _TOUR_S = 80.0, 120.0, 180.0
+_ROBOTS_S = 200.0  # of each robot of MRCLAM 6
+_MAP_M = 0.005
 _CAMERA_HZ = 5.0
 _LOOK_EVERY = 50  # messages of the truth: 1 s
 _DETECTOR = [f"fgloc/sensors/markers/{name}.py" for name in ("edges", "images", "detector")]
+_TOUR = (
+    (-1.8, -1.6), (-0.4, -1.5), (1.0, -1.5), (1.8, -0.5), (1.4, 1.2), (0.2, 1.6), (-0.3, 0.3), (-1.4, -0.2),
+    (-1.8, 1.2), (-0.9, 1.7), (0.3, 0.5), (1.2, -0.5), (0.3, -1.2), (-1.0, -0.8),
+)  # fmt: skip
+
+_scratch: list[tempfile.TemporaryDirectory[str]] = []
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Take:
+    """One simulated recording."""
+
+    variant: Variant
+    floor: Floor
+    split: Split
+    seed: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,13 +104,8 @@ def cache_folder() -> Path:
     return Path(os.environ.get("FGLOC_BENCHMARK_CACHE", Path(user) / "fgloc" / "benchmarks"))
 
 
-def unchanged(made: Scenario) -> Scenario:
-    """The scenario as it is."""
-    return made
-
-
-def scenario(floor: Floor, split: Split, change: Change = unchanged) -> Scenario:
-    """The suite's scenario of this name with the control functions of the split."""
+def scenario(floor: Floor, split: Split) -> Scenario:
+    """The suite's scenario of this name with the control functions of the split, everything exactly as written."""
     entry = next(e for e in load_suite(BUNDLED).entries if e.scenario.name == floor)
     control = next(run.control for run in entry.runs if run.split == split)
     camera = entry.scenario.camera
@@ -96,62 +113,78 @@ def scenario(floor: Floor, split: Split, change: Change = unchanged) -> Scenario
     assert camera is not None
     changes = {
         "control": control,
-        "duration_s": DURATION_S,
+        "duration_s": _DURATION_S,
         "camera": camera.model_copy(update={"rate_hz": _CAMERA_HZ}),
         "installation": None,
     }
-    return change(entry.scenario.model_copy(update=changes))
+    return entry.scenario.model_copy(update=changes)
 
 
-def prepare(floors: Sequence[Floor], split: Split, seeds: Sequence[int], change: Change = unchanged) -> None:
+def _scenario(take: Take) -> Scenario:
+    made = scenario(take.floor, take.split)
+    if take.variant == "perfect":
+        return made
+    if take.variant == "map5mm":
+        return made.model_copy(update={"installation": Installation(marker_position_m=_MAP_M)})
+    robot = made.robot.model_copy(update={"radius_scale": (1.0, 1.0)})
+    made = made.model_copy(update={"robot": robot, "installation": Installation.as_installed()})
+    if take.variant == "found":
+        return made.model_copy(update={"duration_s": _FOUND_S})
+    if take.variant == "tour":
+        changes = {
+            "duration_s": _TOUR_S,
+            "start": (*_TOUR[0], 0.0),
+            "world": World(size_m=(6.0, 6.0), markers=Markers(count=16)),
+            "control": Control(waypoints=_TOUR, speed=0.42),
+        }
+        return made.model_copy(update=changes)
+    return made
+
+
+def _job(take: Take) -> Job:
+    """Recording to be made, and its folder in the cache."""
+    made = _scenario(take)
+    key = hashlib.sha256(describe(made, take.seed, True).encode()).hexdigest()[:12]
+    return Job(made, take.seed, f"{take.floor}_{take.split}_{take.seed}_{key}", take.split)
+
+
+def folder(take: Take) -> str:
+    """Name of the recording's folder in the cache, which changes with its scenario."""
+    return _job(take).folder
+
+
+def prepare(takes: Iterable[Take]) -> None:
     """Record what is not yet there, in as many processes as there are cores.
 
     Raises:
         RenderError: there is no OpenGL.
         SimulationError: a run failed.
     """
-    todo = [job(floor, split, seed, change) for floor in floors for seed in seeds]
-    record_missing(todo)
-
-
-def job(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> Job:
-    """Recording to be made, and its folder in the cache."""
-    made = scenario(floor, split, change)
-    key = hashlib.sha256(describe(made, seed, True).encode()).hexdigest()[:12]
-    return Job(made, seed, f"{floor}_{split}_{seed}_{key}", split)
-
-
-def record_missing(todo: list[Job]) -> None:
-    """Record what is not yet there; raises as `prepare`."""
+    todo = sorted((_job(take) for take in sorted(set(takes))), key=lambda job: -job.scenario.duration_s)
     if any(not is_recorded(j.scenario, j.seed, cache_folder() / j.folder, True) for j in todo):
         record_suite(todo, cache_folder(), camera=True, workers=os.cpu_count() or 1)
 
 
 @lru_cache(maxsize=6)
-def load(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> Recorded:
+def load(take: Take) -> Recorded:
     """One recording, made first if it is not there."""
-    made = job(floor, split, seed, change)
-    record_missing([made])
-    folder = cache_folder() / made.folder
-    config = config_of(robot_settings(made.scenario))
-    landmarks = load_map(folder / "map.yaml")
-    with open_recording(folder / "bag", config.recording) as recording:
+    prepare([take])
+    job = _job(take)
+    place = cache_folder() / job.folder
+    config = config_of(robot_settings(job.scenario))
+    landmarks = load_map(place / "map.yaml")
+    with open_recording(place / "bag", config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
-        found = _sightings(folder, landmarks.dictionary, recording.events())
+        found = _sightings(place, landmarks.dictionary, recording.events())
         events = tuple(_replaced(recording.events(), found))
         camera = _camera(recording, events)
-    slip_s, slip, slipping = _slip(folder / "bag", start_ns)
-    truth_path = folder / "installed.yaml"
+    slip_s, slip, slipping = _slip(place / "bag", start_ns)
+    truth_path = place / "installed.yaml"
     installed = yaml.safe_load(truth_path.read_text(encoding="utf-8")) if truth_path.is_file() else None
-    truth = [
-        ((e.stamp_ns - start_ns) * 1e-9, e.position[0], e.position[1], quaternion_yaw(e.orientation))
-        for e in events
-        if isinstance(e, TruthEvent)
-    ]
     return Recorded(
-        name=f"{floor}/{split}_{seed}",
-        bag=folder / "bag",
-        map_path=folder / "map.yaml",
+        name=f"{take.floor}/{take.split}_{take.seed}",
+        bag=place / "bag",
+        map_path=place / "map.yaml",
         config=config,
         landmarks=landmarks,
         events=events,
@@ -159,11 +192,65 @@ def load(floor: Floor, split: Split, seed: int, change: Change = unchanged) -> R
         slip_s=slip_s,
         slipping=slipping,
         slip=slip,
-        truth=np.array(truth),
+        truth=_truth(events, start_ns),
         duration_s=duration_s,
         camera=camera,
         installed=installed,
     )
+
+
+def changed(config: Config, changes: Mapping[str, Any]) -> Config:
+    """The configuration with some of its values replaced, given as nested mappings."""
+
+    def merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+        return {**old, **{k: merged(old[k], v) if isinstance(v, Mapping) else v for k, v in new.items()}}
+
+    return config_of(merged(config.model_dump(), changes))
+
+
+def converted(robot: int, scratch: Path) -> tuple[Path, Path, Config]:
+    """Bag, map and settings of a robot of MRCLAM 6, with the model of the other four; converted into a folder."""
+    bag = mrclam.convert(MRCLAM, robot, scratch / f"robot{robot}")
+    robot_yaml, map_path = find_beside(bag, "robot.yaml"), find_beside(bag, "map.yaml")
+    assert robot_yaml is not None
+    assert map_path is not None
+    model = {"motion": {"model": MODELS / f"without_robot{robot}.safetensors"}}
+    return bag, map_path, changed(load_config(robot_yaml), model)
+
+
+@lru_cache(maxsize=2)
+def robot(number: int) -> Recorded:
+    """The first minutes of a robot of MRCLAM 6, which has commands and no wheels."""
+    _scratch.append(tempfile.TemporaryDirectory())  # lasts as long as the process
+    bag, map_path, config = converted(number, Path(_scratch[-1].name))
+    with open_recording(bag, config.recording) as recording:
+        start_ns = recording.span_ns[0]
+        until_ns = start_ns + round(_ROBOTS_S * 1e9)
+        events = tuple(e for e in recording.events() if e.received_ns < until_ns)
+    none = np.zeros((0, 3))
+    return Recorded(
+        name=f"mrclam/robot{number}",
+        bag=bag,
+        map_path=map_path,
+        config=changed(config, {"wheels": {"source": "command"}}),
+        landmarks=load_map(map_path),
+        events=events,
+        start_ns=start_ns,
+        slip_s=none[:, 0],
+        slipping=none[:, 0] > 0,
+        slip=none,
+        truth=_truth(events, start_ns),
+        duration_s=_ROBOTS_S,
+    )
+
+
+def _truth(events: Iterable[Event], start_ns: int) -> FloatArray:
+    poses = [
+        ((e.stamp_ns - start_ns) * 1e-9, e.position[0], e.position[1], quaternion_yaw(e.orientation))
+        for e in events
+        if isinstance(e, TruthEvent)
+    ]
+    return np.array(poses)
 
 
 def slip_intervals(recorded: Recorded, least_s: float = 0.1, join_s: float = 0.3) -> list[tuple[float, float]]:
@@ -200,7 +287,7 @@ def _camera(recording: Recording, events: Sequence[Event]) -> Camera:
 
 @cache
 def _sources(names: tuple[str, ...]) -> bytes:
-    return b"".join((_ROOT / name).read_bytes() for name in names)
+    return b"".join((ROOT / name).read_bytes() for name in names)
 
 
 def _sightings(folder: Path, dictionary: str, events: Iterator[Event]) -> dict[int, CornersEvent]:

@@ -1,4 +1,4 @@
-"""Scores of one run on an installation: errors, consistency, refused sightings, and found values against the truth.
+"""Scores of one run: errors, consistency, refused sightings, detected slips, and found values against the truth.
 
 **What a run found of the installation** is a mapping of names to values with their sigmas. The names, and what the
 truth has under them, are those of `truth_values`; a run may have any part of them.
@@ -7,23 +7,29 @@ truth has under them, are those of `truth_values`; a run may have any part of th
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Self
 
 import numpy as np
 
+from benchmarks.recordings import Recorded, slip_intervals
 from fgloc.config import Config
 from fgloc.evaluation.metrics import match_result, nees
 from fgloc.runner import RunResult
-from fgloc.sensors.markers.images import CornersEvent
-from fgloc.types import Decision, Event, FloatArray, IntArray, LandmarkMap, Mode
+from fgloc.types import Decision, FloatArray, IntArray, LandmarkMap, Mode
 
 Found = Mapping[str, tuple[float, float]]
 """Value and sigma by name."""
 SIGHTINGS = frozenset({"corners", "range_bearing", "marker_pose"})  # kinds of decisions
 _FOUND_AFTER_S = 1.0  # a robot that was carried away may be lost so long after the first marker seen again
 _ANGLES = frozenset({"roll", "pitch", "yaw"})
+_NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave
+_NAMED = re.compile(r"[Mm]arker (\d+) does not stand where the map has it")
+_LINGER_S = 0.5  # a slip that is flagged so long after its end was still found
+_WINDOW_S = 2.0  # a flag may be of a slip, however short, so long before it: the detector's window
+_STEP_S = 0.45  # flagged steps closer than this are of one flag
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +111,6 @@ def errors(result: RunResult, config: Config, unknown_ns: tuple[int, int] | None
     )
 
 
-def carried(given: Sequence[Event], lifted_ns: int) -> tuple[int, int]:
-    """Stamps [ns] at which the robot was carried away, and of the first image after it that shows a marker."""
-    seen = [e.stamp_ns for e in given if isinstance(e, CornersEvent) and e.sightings and e.stamp_ns > lifted_ns]
-    return lifted_ns, min(seen, default=2**62)
-
-
 def lost_share(modes: Sequence[Mode], stamps_ns: IntArray, unknown_ns: tuple[int, int] | None = None) -> float:
     """Share of the poses with mode LOST, but for those that have cause to be (and a second after it)."""
     lost = np.array([mode is Mode.LOST for mode in modes], dtype=bool)
@@ -124,6 +124,74 @@ def refused_share(decisions: Sequence[Decision]) -> float:
     """Share of the sightings that were not used as given; NaN without sightings."""
     refused = [d.reason != "" for d in decisions if d.kind in SIGHTINGS]
     return float(np.mean(refused)) if refused else math.nan
+
+
+# --- Slips and moved landmarks ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Slips:
+    """Detections of the slip detector in one run.
+
+    Attributes:
+        delays_s: from the true onset to the flag, of each slip that was found.
+        found_m: distance that the wheels slipped, of each slip that was found.
+        missed_m: likewise, of each that was not.
+        false_alarms: flags without any slip in the detector's window.
+        path_m: distance travelled.
+    """
+
+    delays_s: tuple[float, ...]
+    found_m: tuple[float, ...]
+    missed_m: tuple[float, ...]
+    false_alarms: int
+    path_m: float
+
+
+def slips(recorded: Recorded, online: RunResult) -> Slips:
+    """Slips found and missed, and false alarms, by the flags and the simulator's slip."""
+    rises = flags(recorded, online.decisions)
+    true = slip_intervals(recorded)
+    delays, found, missed = [], [], []
+    for start, end in true:
+        inside = (recorded.slip_s >= start) & (recorded.slip_s <= end)
+        way = float(np.trapezoid(np.abs(recorded.slip[inside, 0]), recorded.slip_s[inside]))
+        raised = [max(rise - start, 0.0) for rise, fall in rises if fall >= start and rise <= end + _LINGER_S]
+        if raised:
+            delays.append(min(raised))
+            found.append(way)
+        else:
+            missed.append(way)
+    slipping = recorded.slip_s[recorded.slipping]
+    false = sum(not ((slipping > rise - _WINDOW_S) & (slipping <= fall)).any() for rise, fall in rises)
+    return Slips(tuple(delays), tuple(found), tuple(missed), false, recorded.path_m)
+
+
+def flags(recorded: Recorded, decisions: Sequence[Decision]) -> list[tuple[float, float]]:
+    """Times [s from the start] at which the wheels were rejected, as other motion sources contradicted them.
+
+    A flag counts from the step that raised it, not from the earlier ones that it revised.
+    """
+    raised, newest = [], 0
+    for d in decisions:
+        if d.kind != "wheels" or d.stamp_ns <= newest:
+            continue  # an earlier step that is judged again
+        newest = d.stamp_ns
+        if d.reason not in _NOT_FOUND_BY_MOTION:
+            raised.append(newest)
+    out: list[tuple[float, float]] = []
+    for stamp in raised:
+        t = (stamp - recorded.start_ns) * 1e-9
+        if out and t - out[-1][1] <= _STEP_S:
+            out[-1] = (out[-1][0], t)
+        else:
+            out.append((t, t))
+    return out
+
+
+def named(result: RunResult) -> frozenset[int]:
+    """Markers that the notes of a run name as moved."""
+    return frozenset(int(i) for note in result.notes for i in _NAMED.findall(note))
 
 
 # --- The installation -------------------------------------------------------------------------------------------------
