@@ -40,7 +40,7 @@ from fgloc.stats import GATE
 
 
 class NoiseDensity(Section):
-    """White-noise densities: standard deviation per square root of distance, rotation or time.
+    """Densities of white noise, per square root of distance, rotation or time.
 
     The variance over a step is the sum of each squared density times the metres, radians and seconds travelled, so that
     splitting a step leaves the covariance as it was.
@@ -51,8 +51,8 @@ class NoiseDensity(Section):
     yaw_per_sqrt_m: float = expert(0.03, ge=0, le=100, description="rad/√m")
     xy_per_sqrt_rad: float = expert(0.01, ge=0, le=100, description="m/√rad")
     yaw_per_sqrt_rad: float = expert(0.05, ge=0, le=100, description="rad/√rad")
-    xy_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="m/√s, also at rest")
-    yaw_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="rad/√s, also at rest")
+    xy_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="m/√s")
+    yaw_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="rad/√s")
 
 
 class WheelsConfig(Section):
@@ -60,54 +60,47 @@ class WheelsConfig(Section):
 
     source: Literal["auto", "twist", "pose", "ticks", "command", "none"] = Field(
         "auto",
-        description="twist or pose differences of the odometry, wheel angles of the joints, or (no encoder) the "
-        "commands; auto: ticks if the wheels' geometry is given, else pose unless it does not move or its heading is "
-        "not that of its motion, else twist, else command",
+        description="twist or pose of the odometry; ticks of the joints; commands; auto: ticks if the geometry is "
+        "given, else pose if it moves along its heading, else twist, else command",
     )
-    left_joint: str | None = None
-    right_joint: str | None = None
+    left_joint: str | None = Field(None, description="joint of the left wheel")
+    right_joint: str | None = Field(None, description="of the right wheel")
     left_radius: float | None = Field(
-        None, ge=1e-6, le=2.0, description="m: way of one unit of the angle, which is usually a radian"
+        None, ge=1e-6, le=2.0, description="m: way per unit of the angle, usually a radian"
     )
-    right_radius: float | None = Field(None, ge=1e-6, le=2.0, description="m")
-    track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the wheels' contact points")
+    right_radius: float | None = Field(None, ge=1e-6, le=2.0, description="m: likewise")
+    track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the contact points")
     angle_range: float | None = expert(
-        None, ge=1e-3, le=1e9, description="rad: the angle rolls over after this much; None: never"
+        None, ge=1e-3, le=1e9, description="rad after which the angle rolls over; None: never"
     )
-    drive: AnyDrive | None = Field(
-        None, description="a drive other than two wheels, by its kind (docs/drives.md); None: two wheels, as above"
-    )
+    drive: AnyDrive | None = Field(None, description="another drive than two wheels (docs/drives.md)")
     scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
-    scale_omega: float = Field(
-        1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: it counts clockwise"
-    )
-    yaw_per_m: float = expert(0.0, ge=-1, le=1, description="rad/m: yaw gained going straight, by unequal wheels")
-    slowdown: float = expert(
-        0.0, ge=0, le=5.0, description="s/rad: share of the forward speed lost per rad/s of reported turning"
-    )
-    delay_s: float = expert(0.0, ge=0, le=2.0, description="the robot moves this long after the message")
-    hold_s: float = expert(0.5, gt=0, le=60, description="a twist is held for this long when the next one is missing")
-    zero_speed: float = expert(0.0, ge=0, le=10, description="m/s below which a reported speed is rest")
-    zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="rad/s below which a reported rate is rest")
+    scale_omega: float = Field(1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: clockwise")
+    yaw_per_m: float = expert(0.0, ge=-1, le=1, description="rad/m: yaw gained on the straight, by unequal wheels")
+    slowdown: float = expert(0.0, ge=0, le=5.0, description="s/rad: share of the speed lost per rad/s of turning")
+    delay_s: float = expert(0.0, ge=0, le=2.0, description="s: the robot moves so long after the message")
+    hold_s: float = expert(0.5, gt=0, le=60, description="s: a twist is held so long without a next one")
+    zero_speed: float = expert(0.0, ge=0, le=10, description="m/s: a lower speed is rest")
+    zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="rad/s: a lower rate is rest")
     noise: NoiseDensity = NoiseDensity()
     scale_sigma: float = Field(
         0.01,
         ge=0,
         le=0.5,
-        description="how far the radii of both wheels may be off alike; estimated, as all sigmas here",
+        description="of both radii alike; estimated",
     )
-    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="how far the track may be off")
+    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="of the track; estimated")
     time_offset_sigma_s: float = expert(
-        0.005, ge=0, le=1.0, description="s: how far their clock may be off that of the gyro; estimated"
+        0.005, ge=0, le=1.0, description="s: of their clock against the gyro's; estimated"
     )
     yaw_per_m_sigma: float = expert(
         0.015,
         ge=0,
         le=1,
-        description="rad/m: how far yaw_per_m may be off: 0.4 % of unequal radii at a track of 0.26 m",
+        description="rad/m: of yaw_per_m; estimated",
     )
-    slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: how far slowdown may be off")
-    delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: how far delay_s may be off")
+    slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: of slowdown")
+    delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: of delay_s")
 
     @property
     def in_radians(self) -> bool:
@@ -116,13 +109,13 @@ class WheelsConfig(Section):
 
 
 class GyroConfig(Section):
-    """Yaw rate of an IMU, as a motion source of its own (unless the learned motion reads it already)."""
+    """Yaw rate of an IMU."""
 
-    use: bool = expert(True)
-    scale: float = expert(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: it turns the other way")
-    yaw_per_sqrt_s: float = expert(0.002, ge=1e-6, le=10, description="rad/√s: white noise of the integrated rate")
-    scale_sigma: float = expert(0.005, ge=0, le=0.5, description="how far the rate's scale may be off; estimated")
-    bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="rad/s, before anything is known of the bias")
+    use: bool = expert(True, description="false: the gyro is not read")
+    scale: float = expert(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: clockwise")
+    yaw_per_sqrt_s: float = expert(0.002, ge=1e-6, le=10, description="rad/√s: noise of the integrated rate")
+    scale_sigma: float = expert(0.005, ge=0, le=0.5, description="of scale; estimated")
+    bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="rad/s: of the bias at the start")
     tilt_sigma_rad: float = constant(
         0.0087,
         "mounting to half a degree",
@@ -153,27 +146,23 @@ _Place = Annotated[float, Field(ge=-1e3, le=1e3)]  # m or rad, on a robot
 class CameraConfig(Section):
     """The camera, where the recording does not say."""
 
-    file: Path | None = Field(None, description="ROS calibration YAML or Kalibr YAML; None: CameraInfo")
-    rescale: bool = expert(False, description="scale the calibration to the image size instead of refusing")
-    focal_scale: float = expert(1.0, ge=0.01, le=100, description="true focal length over that of the calibration")
-    cx_px: float | None = expert(
-        None, ge=-1e5, le=1e5, description="px: principal point; None, as below: the calibration's"
-    )
-    cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="px")
-    k1: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; other models are taken as they are")
-    k2: float | None = expert(None, ge=-100, le=100)
-    position_sigma_m: float = expert(
-        0.003, ge=0, le=1.0, description="m: how far off it is mounted, on each axis; estimated"
-    )
-    rotation_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="rad: likewise, about each axis (0.4 degrees)")
-    focal_sigma: float = expert(0.003, ge=0, le=0.5, description="how far the focal length may be off, as a share")
-    principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="px: how far the principal point may be off")
-    distortion_sigma: float = expert(0.005, ge=0, le=0.5, description="how far k1 and k2 may be off")
+    file: Path | None = Field(None, description="calibration, ROS or Kalibr YAML; None: CameraInfo")
+    rescale: bool = expert(False, description="scale the calibration to the image size")
+    focal_scale: float = expert(1.0, ge=0.01, le=100, description="true focal length over the calibration's")
+    cx_px: float | None = expert(None, ge=-1e5, le=1e5, description="px: principal point; None: the calibration's")
+    cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="px, likewise")
+    k1: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; None: the calibration's")
+    k2: float | None = expert(None, ge=-100, le=100, description="likewise")
+    position_sigma_m: float = expert(0.003, ge=0, le=1.0, description="m: of the mounting, on each axis; estimated")
+    rotation_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="rad: likewise, about each axis")
+    focal_sigma: float = expert(0.003, ge=0, le=0.5, description="of the focal length, as a share")
+    principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="px: of the principal point")
+    distortion_sigma: float = expert(0.005, ge=0, le=0.5, description="of k1 and k2")
     time_offset_sigma_s: float = expert(
         0.012,
         ge=0,
         le=1.0,
-        description="s: how far its clock may be off that of the gyro (without one: of the wheels); estimated",
+        description="s: of its clock against the gyro's (else the wheels'); estimated",
     )
     time_jitter_s: float = constant(
         0.002,
@@ -185,16 +174,16 @@ class CameraConfig(Section):
 
 
 class NamedCameraConfig(CameraConfig):
-    """One of several cameras: its topics, its place, and what `CameraConfig` has."""
+    """One of several cameras: these keys, and those of `camera` and `expert.camera`."""
 
     image: str | None = Field(None, description="topic of its images")
-    camera_info: str | None = Field(None, description="topic of its calibration; None: the one beside its images")
-    sightings: str | None = Field(None, description="topic of what another node has found in its images")
+    camera_info: str | None = Field(None, description="topic of its calibration; None: beside its images")
+    sightings: str | None = Field(None, description="topic of markers that another node found in them")
     pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
-        None, description="in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
+        None, description="in the base frame: x y z [m] roll pitch yaw [rad]; None: tf"
     )
     axes: Literal["body", "optical"] | None = Field(
-        None, description="axes that pose refers to: z forward (optical; None too), or x forward"
+        None, description="axes of pose: optical (z forward; None too) or body (x forward)"
     )
 
     @model_validator(mode="after")
@@ -207,32 +196,26 @@ class NamedCameraConfig(CameraConfig):
 class LandmarksConfig(Section):
     """Range/bearing and marker-pose sightings."""
 
-    range_sigma_m: float = Field(0.1, ge=1e-4, le=100)
-    range_sigma_per_m: float = expert(0.0, ge=0, le=10, description="added range sigma per metre of range")
-    bearing_sigma_rad: float = Field(0.02, ge=1e-5, le=3.2)
+    range_sigma_m: float = Field(0.1, ge=1e-4, le=100, description="noise of a range")
+    range_sigma_per_m: float = expert(0.0, ge=0, le=10, description="added sigma per metre of range")
+    bearing_sigma_rad: float = Field(0.02, ge=1e-5, le=3.2, description="noise of a bearing")
     range_scale: float = expert(1.0, ge=1e-4, le=1e4, description="true over reported range")
-    range_along_axis: bool = expert(
-        False, description="the reported range is the distance along the sensor's axis: divided by cos(bearing)"
-    )
+    range_along_axis: bool = expert(False, description="the reported range is a depth along the sensor's axis")
     range_bias_m: float = expert(0.0, ge=-100, le=100, description="subtracted from the reported range")
     bearing_bias_rad: float = expert(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
-    range_scale_sigma: float = expert(
-        0.005, ge=0, le=0.5, description="how far range_scale may be off; estimated during the run"
-    )
-    bearing_bias_sigma_rad: float = expert(
-        0.007, ge=0, le=0.5, description="how far bearing_bias_rad may be off; estimated during the run"
-    )
+    range_scale_sigma: float = expert(0.005, ge=0, le=0.5, description="of range_scale; estimated")
+    bearing_bias_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="of bearing_bias_rad; estimated")
     position_sigma_m: float = expert(
-        0.0, ge=0, le=1.0, description="m: how far off the sensor is mounted, ahead and to the left; estimated"
+        0.0, ge=0, le=1.0, description="m: of the mounting, ahead and to the left; estimated"
     )
     time_offset_sigma_s: float = expert(
-        0.012, ge=0, le=1.0, description="s: how far the sensor's clock may be off that of gyro or wheels; estimated"
+        0.012, ge=0, le=1.0, description="s: of the sensor's clock against gyro or wheels; estimated"
     )
     yaw_sigma_rad: float | None = expert(
         None,
         ge=1e-5,
         le=3.2,
-        description="of a marker pose's yaw; None: marker poses are used as range and bearing only",
+        description="noise of a marker pose's yaw; None: only range and bearing are used",
     )
     cauchy_k: float = expert(
         3.0, ge=0.01, le=1e6, description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose"
@@ -248,22 +231,21 @@ class LandmarksConfig(Section):
         0.0,
         ge=0,
         le=1e6,
-        description="correlation time of one landmark's errors: a sighting so soon after another has its covariance "
-        "times repeat_s over the time between them; not of marker corners",
+        description="s that errors of one landmark last; sooner repetitions count for less; not of corners",
     )
 
 
 class MarkersConfig(Section):
     """Marker detection in images."""
 
-    dictionary: str | None = Field(None, description='OpenCV name, "DICT_4X4_50"; None: the map\'s')
-    default_size_m: float | None = Field(None, ge=1e-3, le=5.0, description="side, for maps that give none")
+    dictionary: str | None = Field(None, description="OpenCV's name, as DICT_4X4_50; None: the map's")
+    default_size_m: float | None = Field(None, ge=1e-3, le=5.0, description="side, where the map gives none")
     sigma_px: float = Field(0.5, ge=1e-3, le=100, description="noise of one corner coordinate")
     blur_s: float = expert(
         2e-4,
         ge=0,
         le=0.1,
-        description="s: a blurred corner is off by as much as the image moves in this time (3 % of 6 ms)",
+        description="s: a corner is off by the image's motion in this time",
     )
     cauchy_k: float = constant(
         3.0,
@@ -311,15 +293,13 @@ class MotionConfig(Section):
 
     model: Annotated[Path | None, BeforeValidator(model_path)] = Field(
         None,
-        description="a .safetensors file that fgloc train wrote, or a shipped one: shipped:sim/diff_drive",
+        description="file of `fgloc train`, or shipped:sim/diff_drive",
     )
-    use: bool = expert(True)
+    use: bool = expert(True, description="false: the model is not used")
     scale: float = expert(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
-    scale_sigma: float = expert(
-        0.01, ge=0, le=0.5, description="how far this robot may be faster or slower than the model's; estimated"
-    )
+    scale_sigma: float = expert(0.01, ge=0, le=0.5, description="of scale; estimated")
     correlation: Literal["joint", "independent"] = expert(
-        "joint", description="joint: decorrelated from the wheels; independent: counted twice (for comparison)"
+        "joint", description="joint: decorrelated from the wheels; independent: for comparison"
     )
 
 
@@ -345,9 +325,7 @@ class SensorSections(Section):
     wheels: WheelsConfig = WheelsConfig()
     gyro: GyroConfig = GyroConfig()
     camera: CameraConfig = CameraConfig()
-    cameras: dict[_CameraName, NamedCameraConfig] = Field(
-        {}, description="several cameras in place of one, by name (docs/cameras.md)"
-    )
+    cameras: dict[_CameraName, NamedCameraConfig] = Field({}, description="several cameras, by name (docs/cameras.md)")
     markers: MarkersConfig = MarkersConfig()
     landmarks: LandmarksConfig = LandmarksConfig()
     motion: MotionConfig = MotionConfig()
@@ -466,10 +444,10 @@ class RecordingConfig(Section):
     odometries: tuple[OdometryTopic, ...] = Field(
         (),
         max_length=8,
-        description="odometries beside the wheels: name and topic of each, and its pose (docs/odometries.md)",
+        description="beside the wheels: name, topic, pose of each (docs/odometries.md)",
     )
     received_stamps: tuple[_KnownRole, ...] = Field(
-        (), description="roles whose header stamps are wrong: use receive times"
+        (), description="roles whose header stamps are replaced by receive times"
     )
     clock_sigma_s: float = constant(
         0.003,
@@ -479,19 +457,18 @@ class RecordingConfig(Section):
         description="s: how far the clock may be off to which the others are compared: the gyro's, or the wheels'",
     )
     stamp_offset_s: dict[_KnownRole, Annotated[float, Field(ge=-4e9, le=4e9)]] = Field(
-        {}, description="added to a role's stamps [s]: a known clock offset"
+        {}, description="added to a role's stamps [s]"
     )
-    base_frame: str | None = Field(None, description="the robot's base frame; None: base_link, base_footprint or base")
+    base_frame: str | None = Field(None, description="None: base_link, base_footprint or base")
     sightings_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
-        None, description="sensor in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
+        None, description="sensor in the base frame: x y z [m] roll pitch yaw [rad]; None: tf"
     )
     sightings_axes: Literal["body", "optical"] | None = Field(
         None,
-        description="axes that sightings_pose or marker poses refer to: x forward, or z forward; None: optical for "
-        "cameras (images, corners), body for the rest",
+        description="of sightings_pose and marker poses: body, or optical (None: for cameras)",
     )
     imu_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
-        None, description="IMU in the base frame: x y z [m] roll pitch yaw [rad]; overrides tf"
+        None, description="IMU, likewise; None: tf"
     )
 
     @model_validator(mode="after")
@@ -511,8 +488,8 @@ class RecordingConfig(Section):
 class GateConfig(Section):
     """What is too wrong to enter the graph."""
 
-    max_speed: float = expert(5.0, gt=0, le=1e3, description="m/s")
-    max_yaw_rate: float = expert(10.0, gt=0, le=1e4, description="rad/s")
+    max_speed: float = expert(5.0, gt=0, le=1e3, description="m/s, of the robot")
+    max_yaw_rate: float = expert(10.0, gt=0, le=1e4, description="rad/s, of the robot")
     max_wheel_rate: float = constant(500.0, "ticks taken for radians exceed it", gt=0, le=1e6, description="rad/s")
     max_position: float = expert(1e6, gt=0, le=1e9, description="m, of an odometry or truth pose")
     max_range: float = expert(50.0, gt=0, le=1e5, description="m, of a sighting")
@@ -558,9 +535,9 @@ class GateConfig(Section):
 class KeyframesConfig(Section):
     """When a pose is added to the graph."""
 
-    max_interval_s: float = expert(0.2, ge=0.001, le=60)
+    max_interval_s: float = expert(0.2, ge=0.001, le=60, description="s between two poses, at most")
     min_interval_s: float = constant(0.05, "bounds the poses per second", ge=0, le=60)
-    reorder_s: float = expert(0.1, ge=0, le=60, description="late messages wait this long to be put in order")
+    reorder_s: float = expert(0.1, ge=0, le=60, description="s that messages wait to be put in order")
     history_s: float = constant(
         2.0,
         "the shipped models read 0.8 s",
@@ -577,28 +554,26 @@ class KeyframesConfig(Section):
 
 
 class MapConfig(Section):
-    """How well the landmarks of the map were surveyed, where the map does not give it of each."""
+    """Units and survey of the map, where it does not give sigmas of its own."""
 
-    scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres of one unit of the map's positions")
-    size_scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres of one unit of the sizes that the map gives")
-    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m, on each axis; estimated during the run")
-    rotation_sigma_rad: float = expert(
-        0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis (0.5 degrees)"
-    )
+    scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres per unit of positions")
+    size_scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres per unit of the map's marker sizes")
+    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m: of a landmark, on each axis; estimated")
+    rotation_sigma_rad: float = expert(0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis")
 
 
 class EstimatorConfig(Section):
     """The incremental estimator."""
 
     kind: Literal["fixed_lag", "isam2", "ekf"] = Field(
-        "fixed_lag", description="isam2: the whole run; ekf: a filter of the pose alone, for comparison"
+        "fixed_lag", description="isam2: the whole run; ekf: for comparison"
     )
-    ground: Literal["flat", "uneven"] = Field("flat", description="uneven: height, roll and pitch are estimated too")
-    lag_s: float = expert(10.0, ge=0.05, le=1e5)
+    ground: Literal["flat", "uneven"] = Field("flat", description="uneven: also height, roll and pitch")
+    lag_s: float = expert(10.0, ge=0.05, le=1e5, description="s that the fixed lag keeps open")
     relinearize_threshold: float = constant(0.01, "1 cm or 0.6 degrees", ge=1e-6, le=10)
     initial_pose: tuple[_Far, _Far, _Far] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
-    initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = expert((0.05, 0.05, 0.05))
-    initialise_s: float = expert(5.0, ge=0.01, le=1e5, description="how long to collect sightings for the first pose")
+    initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = expert((0.05, 0.05, 0.05), description="m, m, rad: of initial_pose")
+    initialise_s: float = expert(5.0, ge=0.01, le=1e5, description="s that sightings are collected for the first pose")
     gate_probability: float = constant(
         GATE,
         "one sound sighting in 10 000",
@@ -606,9 +581,9 @@ class EstimatorConfig(Section):
         lt=1,
         description="a sighting less likely than 1 - this is not fused",
     )
-    dead_reckoning_after_s: float = expert(2.0, gt=0, le=1e6, description="without a fix for this long: DEAD_RECKONING")
+    dead_reckoning_after_s: float = expert(2.0, gt=0, le=1e6, description="s without a fix until DEAD_RECKONING")
     motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = expert(
-        "none", description="robust kernel on the wheels' factors, online; for comparison: it cannot locate a slip"
+        "none", description="robust kernel on the wheels, online; for comparison"
     )
 
 
@@ -627,10 +602,12 @@ class Distrust(Section):
 
 
 class WeightsConfig(Section):
-    """How the weights of motion and landmark factors follow how the sources differ."""
+    """Weights of motion and landmark factors."""
 
-    adaptive: bool = expert(True, description="false: covariances stay as they were made; sightings are still gated")
-    distrust: tuple[Distrust, ...] = expert((), description="known failures: inside, the source's factors are left out")
+    adaptive: bool = expert(True, description="false: no test of sources; sightings are still gated")
+    distrust: tuple[Distrust, ...] = expert(
+        (), description="known failures: `source`, `start_s`, `end_s`; it is left out"
+    )
     window_s: float = constant(
         2.0,
         "part of the fault test",
@@ -658,7 +635,7 @@ class LiveConfig(Section):
     """A live run."""
 
     startup_s: float = expert(
-        2.0, ge=0, le=1e6, description="the run begins this long after its first event, without what has not come"
+        2.0, ge=0, le=1e6, description="s after the first event, when the run begins with what has come"
     )
     image_queue: int = constant(
         4, "older images are late", gt=0, le=100_000, description="images that may wait for detection; the oldest goes"
@@ -666,32 +643,28 @@ class LiveConfig(Section):
 
 
 class IntegrityConfig(Section):
-    """The bound on the error of each pose, see docs/integrity.md."""
+    """Bounds on the error of each pose (docs/integrity.md)."""
 
     risk_per_hour: float = expert(
-        1e-3, ge=1e-9, le=0.5, description="probability that the error exceeds the bound, in an hour of driving"
+        1e-3, ge=1e-9, le=0.5, description="that the error exceeds the bound, in an hour of driving"
     )
-    alert_m: float | None = Field(
-        None, gt=0, le=1e6, description="a bound on the position above this is an alert; None: no alerts"
-    )
-    alert_yaw_rad: float | None = Field(None, gt=0, le=3.2, description="likewise, of the yaw")
+    alert_m: float | None = Field(None, gt=0, le=1e6, description="larger bounds on the position raise an alert")
+    alert_yaw_rad: float | None = Field(None, gt=0, le=3.2, description="rad: likewise, on the yaw")
 
 
 class TruthConfig(Section):
-    """What is known of the truth's frame. Only evaluation reads it."""
+    """Frame of the truth. Only evaluation reads it."""
 
-    yaw_offset_rad: float = Field(
-        0.0, ge=-100, le=100, description="yaw of the truth's body axes in the base frame; subtracted"
-    )
-    offset_m: tuple[_Place, _Place] = Field((0.0, 0.0), description="origin of the truth's body in the base frame: x y")
+    yaw_offset_rad: float = Field(0.0, ge=-100, le=100, description="yaw of the tracked body in the base frame")
+    offset_m: tuple[_Place, _Place] = Field((0.0, 0.0), description="its origin in the base frame: x y")
     axes: Literal["enu", "ned"] = expert("enu", description="ned: x north, y east, yaw clockwise")
-    scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres of one unit of its positions")
+    scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres per unit of positions")
     align: Literal["none", "se2"] = Field("none", description="se2: the truth's frame is not the map's")
-    max_gap_s: float = expert(0.2, gt=0, le=1e6, description="the truth is not interpolated across longer gaps")
+    max_gap_s: float = expert(0.2, gt=0, le=1e6, description="s: longer gaps are not interpolated")
 
 
 class Config(SensorSections):
-    """Everything. ``robot.yaml`` holds the parts that differ from these defaults."""
+    """All settings. ``robot.yaml`` holds the parts that differ from these defaults."""
 
     recording: RecordingConfig = RecordingConfig()
     gate: GateConfig = GateConfig()

@@ -10,11 +10,13 @@ import schema_files
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from fgloc.config import robot_file
+from fgloc.config import CameraConfig, robot_file
 from fgloc_training.config import TrainConfig
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGES = {"configuration.md": robot_file(), "identification.md": TrainConfig}
+_OWN_TABLE = (CameraConfig,)
+_OF_KINDS = "`kind` names the drive, the other keys describe it."
 
 
 def sections(model=PAGES["configuration.md"], path=""):
@@ -27,15 +29,39 @@ def sections(model=PAGES["configuration.md"], path=""):
             kind = typing.get_args(field.annotation)[1]
             if isinstance(kind, type) and issubclass(kind, BaseModel):
                 yield f"{path}{name}.NAME", kind
-        for kind in _kinds(field):
-            yield f"{path}{name}: {kind.model_fields['kind'].default}", kind
+        if kinds := tuple(_kinds(field)):
+            yield f"{path}{name}", kinds
 
 
-def rows(model):
-    """One line of a Markdown table per value of a section."""
-    for name, field in model.model_fields.items():
-        if _section(field) is None:
-            yield f"| `{name}` | {_default(field.default)} | {(field.description or '').replace('|', '/')} |"
+def rows(section):
+    """One line of a Markdown table per value of a section, or of one of several kinds.
+
+    Keys of a parent class that has a table of its own stand there alone.
+    """
+    if isinstance(section, tuple):
+        yield from _rows_of_kinds(section)
+        return
+    elsewhere = {key for base in section.__mro__[1:] if base in _OWN_TABLE for key in base.model_fields}
+    for name, field in section.model_fields.items():
+        if _section(field) is None and name not in elsewhere:
+            yield f"| `{name}` | {_default(field.default)} | {_meaning(field)} |"
+
+
+def _rows_of_kinds(kinds):
+    """One line per key, default and meaning, with the kinds that have it."""
+    found = {}
+    for kind in kinds:
+        for name, field in kind.model_fields.items():
+            if name != "kind":
+                row = name, _default(field.default), _meaning(field)
+                found.setdefault(row, []).append(kind.model_fields["kind"].default)
+    for (name, default, meaning), having in sorted(found.items(), key=lambda item: -len(item[1])):
+        of = "all" if len(having) == len(kinds) else ", ".join(having)
+        yield f"| `{name}` | {of} | {default} | {meaning} |"
+
+
+def _meaning(field):
+    return (field.description or "").replace("|", "/")
 
 
 def _section(field):
@@ -67,8 +93,10 @@ def tables(model=PAGES["configuration.md"]):
     parts = []
     for name, section in (("top level", model), *sections(model)):
         if lines := list(rows(section)):
-            about = section.__doc__.strip().splitlines()[0]
-            head = f"### {name}\n\n{about}\n\n| key | default | meaning |\n|---|---|---|"
+            about, columns = _OF_KINDS, "| key | kinds | default | meaning |\n|---|---|---|---|"
+            if not isinstance(section, tuple):
+                about, columns = section.__doc__.strip().splitlines()[0], "| key | default | meaning |\n|---|---|---|"
+            head = f"### {name}\n\n{about}\n\n{columns}"
             parts.append("\n".join([head, *lines]) + "\n")
     return "\n".join(parts)
 

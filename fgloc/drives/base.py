@@ -76,18 +76,13 @@ class Drive(Section):
     unequal: ClassVar[bool] = True  # whether unequal wheels turn it on the straight: `wheels.yaw_per_m`
 
     kind: str
-    radius: Metres = Field(
-        description="m, of the driven wheels; 1 where the joint's rate is a speed in m/s. With ticks_per_turn of the "
-        "motor and a gear, the wheel's over the gear ratio"
-    )
+    radius: Metres = Field(description="m, of the driven wheels, over the gear ratio of ticks_per_turn")
     ticks_per_turn: float | None = Field(
-        None, ge=1e-3, le=1e9, description="positions of the driven joints are encoder ticks, so many a turn; None: rad"
+        None, ge=1e-3, le=1e9, description="encoder ticks a turn of the driven joints; None: rad"
     )
-    rolls_over: float | None = Field(
-        None, ge=1e-3, le=1e15, description="positions of the driven joints roll over after this much; None: never"
-    )
+    rolls_over: float | None = Field(None, ge=1e-3, le=1e15, description="where their positions roll over; None: never")
     sigmas: dict[str, Annotated[float, Field(ge=0, le=100)]] = Field(
-        {}, description="how far parameters may be off, by name and in their unit; 0: exact; the others as documented"
+        {}, description="by parameter, in its unit; 0: exact; else as in docs/drives.md"
     )
 
     # --- what each drive says of itself ---
@@ -177,12 +172,8 @@ class Drive(Section):
 class Steered(Drive):
     """Base of the drives with steering, whose encoder may count ticks."""
 
-    steering_ticks: float | None = Field(
-        None, ge=2, le=1e9, description="steering is in ticks, so many a turn, counted up to half a turn; None: rad"
-    )
-    steering_ratio: float = Field(
-        1.0, ge=-1e3, le=1e3, description="angle of the wheel over the reported one; of a steering wheel its gear"
-    )
+    steering_ticks: float | None = Field(None, ge=2, le=1e9, description="ticks a turn of the steering; None: rad")
+    steering_ratio: float = Field(1.0, ge=-1e3, le=1e3, description="angle of the wheel over the reported one")
 
     def steering(self, reported: float) -> float:
         """Angle [rad] of a steered joint, from ticks where it reports them."""

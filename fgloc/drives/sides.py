@@ -17,9 +17,9 @@ class _Sides(Drive):
     """Base of drives with wheels on two sides."""
 
     left: tuple[str, ...] = Field(min_length=1, description="joints of the left side")
-    right: tuple[str, ...] = Field(min_length=1, description="of the right side")
+    right: tuple[str, ...] = Field(min_length=1, description="joints of the right side")
     track: Metres = Field(description="m, between the sides")
-    axle_x: Place = Field(0.0, description="m: x in the base frame of the point that does not move sideways")
+    axle_x: Place = Field(0.0, description="m: x of the point that does not move sideways")
 
     @property
     def driven(self) -> tuple[str, ...]:

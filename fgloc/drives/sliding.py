@@ -32,7 +32,7 @@ class Mecanum(Drive):
     kind: Literal["mecanum"] = "mecanum"
     wheels: tuple[str, str, str, str] = Field(description="joints: front left, front right, rear left, rear right")
     half_sum: Metres = Field(description="m: half the wheelbase and half the track, added")
-    lateral: float = Field(1.0, ge=0.1, le=10, description="true way sideways over that of rollers without slip")
+    lateral: float = Field(1.0, ge=0.1, le=10, description="true over ideal way sideways")
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -64,11 +64,11 @@ class Omni(Drive):
 
     slides: ClassVar[bool] = True
     kind: Literal["omni"] = "omni"
-    wheels: tuple[str, ...] = Field(min_length=3, description="joints")
+    wheels: tuple[str, ...] = Field(min_length=3, description="joints of the wheels")
     angles_deg: tuple[float, ...] = Field(
-        min_length=3, description="degrees: where on the ring each wheel is, from straight ahead to the left"
+        min_length=3, description="place of each on the ring, from straight ahead to the left"
     )
-    ring: Metres = Field(description="m, radius of the ring")
+    ring: Metres = Field(description="m: its radius")
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -97,10 +97,10 @@ class Swerve(Steered):
 
     slides: ClassVar[bool] = True
     kind: Literal["swerve"] = "swerve"
-    wheels: tuple[str, ...] = Field(min_length=2, description="joints of the modules' wheels")
-    steering_joints: tuple[str, ...] = Field(min_length=2, description="joints of their steering, in the same order")
-    places: tuple[tuple[Place, Place], ...] = Field(min_length=2, description="m: x y of the modules, likewise")
-    steering_zeros: tuple[float, ...] = Field((), description="rad: added to the angles; none: 0")
+    wheels: tuple[str, ...] = Field(min_length=2, description="joints of the wheels")
+    steering_joints: tuple[str, ...] = Field(min_length=2, description="joints of the steering, in the same order")
+    places: tuple[tuple[Place, Place], ...] = Field(min_length=2, description="m: x y of the modules")
+    steering_zeros: tuple[float, ...] = Field((), description="rad: added to the angles")
     size: float = Field(1.0, ge=0.1, le=10, description="true places over those given")
 
     @property

@@ -18,8 +18,8 @@ class _Axle(Steered):
     """Base of drives with a rear axle that does not steer."""
 
     unequal: ClassVar[bool] = False
-    wheelbase: Metres = Field(description="m, from the rear axle to the steered one")
-    steering_zero: float = Field(0.0, ge=-2, le=2, description="rad: added to the angle; positive: to the left")
+    wheelbase: Metres = Field(description="m, from rear to steered axle")
+    steering_zero: float = Field(0.0, ge=-2, le=2, description="rad: added to the angle")
     axle_x: Place = Field(0.0, description="m: x of the rear axle in the base frame")
 
     def usual_sigmas(self) -> dict[str, float]:
@@ -45,14 +45,12 @@ class Ackermann(_Axle):
     """
 
     kind: Literal["ackermann"] = "ackermann"
-    wheels: tuple[str, ...] = Field(("speed",), min_length=1, description="joints of the wheels that are measured")
-    wheel_y: tuple[Place, ...] = Field(
-        (), description="m: how far left of the middle each of them is; none: in the middle, or left and right alike"
-    )
+    wheels: tuple[str, ...] = Field(("speed",), min_length=1, description="joints of the measured wheels")
+    wheel_y: tuple[Place, ...] = Field((), description="m: of each, left of the middle; none: 0")
     steering_joints: tuple[str, ...] = Field(
-        ("steering_angle",), min_length=1, max_length=2, description="one joint, or that of the left and of the right"
+        ("steering_angle",), min_length=1, max_length=2, description="one joint, or left and right"
     )
-    radius: Metres = Field(1.0, description="m, of the wheels; 1 where their rate is a speed in m/s")
+    radius: Metres = Field(1.0, description="m, of the wheels; 1: their rate is a speed in m/s")
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -110,7 +108,7 @@ class Tricycle(_Axle):
     """One wheel in front that steers and drives, and an axle behind that does neither."""
 
     kind: Literal["tricycle"] = "tricycle"
-    wheel: str = Field(description="joint of the wheel's travel")
+    wheel: str = Field(description="joint of the wheel's rotation")
     steering_joint: str = Field(description="joint of its steering")
 
     @property

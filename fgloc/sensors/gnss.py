@@ -50,12 +50,12 @@ class GnssConfig(Section):
             Annotated[float, Field(ge=-1e4, le=1e5)],
         ]
         | None
-    ) = Field(None, description="of the map: latitude, longitude [degrees], altitude above the ellipsoid [m]")
-    yaw_rad: float = Field(0.0, ge=-7, le=7, description="of the map's x axis from east, counter-clockwise")
+    ) = Field(None, description="of the map: latitude, longitude [°], ellipsoidal altitude [m]")
+    yaw_rad: float = Field(0.0, ge=-7, le=7, description="rad: map's x axis from east, counter-clockwise")
     antenna: tuple[_Metres, _Metres] | None = Field(
-        None, description="in the base frame: x y [m]; None: by tf and the message's frame_id, else at the base"
+        None, description="x y [m] in the base frame; None: tf, else the base"
     )
-    sigma_m: float = Field(1.5, ge=1e-3, le=1e3, description="horizontal, where the message gives no covariance")
+    sigma_m: float = Field(1.5, ge=1e-3, le=1e3, description="m, where the message has no covariance")
     sigma_scale: float = Field(1.0, ge=0.01, le=100, description="true sigma over the message's")
 
 

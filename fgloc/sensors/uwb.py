@@ -53,20 +53,18 @@ class UwbConfig(Section):
     """Ultra-wideband ranges to anchors."""
 
     anchors: dict[int, tuple[_Metres, _Metres, _Metres]] = Field(
-        {}, max_length=1000, description="place of each anchor by its number: x y z [m] in the map"
+        {}, max_length=1000, description="x y z [m] in the map, by number"
     )
     tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
     sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
-    bias_m: float = Field(0.0, ge=-10, le=10, description="subtracted from every range: the delay of the antennas")
-    bias_sigma_m: float = Field(0.1, ge=0, le=10, description="how far bias_m may be off; estimated")
-    scale_sigma: float = Field(
-        0.05, ge=0, le=0.5, description="how far reported over true range may be off 1; estimated; 0: exact"
-    )
+    bias_m: float = Field(0.0, ge=-10, le=10, description="m: subtracted from every range")
+    bias_sigma_m: float = Field(0.1, ge=0, le=10, description="of bias_m; estimated")
+    scale_sigma: float = Field(0.05, ge=0, le=0.5, description="of reported over true range; estimated")
     non_line_of_sight: Literal["mixture", "reject"] = Field(
-        "mixture", description="what becomes of a range that the gate refuses because it is too long"
+        "mixture", description="mixture: use too long ranges with nlos_*; reject: drop them"
     )
-    nlos_bias_m: float = Field(1.0, ge=0, le=100, description="mixture: by how much such a range is too long ...")
-    nlos_sigma_m: float = Field(3.0, ge=0.01, le=100, description="... give or take; holds for one stretch of them")
+    nlos_bias_m: float = Field(1.0, ge=0, le=100, description="m by which such a range is too long ...")
+    nlos_sigma_m: float = Field(3.0, ge=0.01, le=100, description="... and its sigma")
 
 
 # --- Events -----------------------------------------------------------------------------------------------------------
