@@ -12,7 +12,8 @@ from fgloc.types import Event, MotionEvent, RawEvent, SightingsEvent
 
 # --- The common clock -------------------------------------------------------------------------------------------------
 
-_LEAP_NS = 500_000_000  # a stamp further ahead than this, and than four usual intervals, needs confirmation
+_LEAP_NS = 500_000_000  # a stamp further ahead than this, and than four usual intervals, needs confirmation; also one
+# that is further ahead than this of what the time of receipt has advanced
 _CONFIRM_COUNT = 3  # events that agree on a new time ...
 _CONFIRM_NS = 250_000_000  # ... over this span confirm it ...
 _CONFIRM_BACK_NS = 100_000_000  # ... and, of an earlier time, received over this: late messages come in a burst
@@ -34,11 +35,13 @@ class ClockGuard:
 
     A stamp far ahead of the newest or far behind it is kept in a bounded queue until others agree with it (the clock
     has jumped, or all sensors had a gap) or until one arrives that fits the running clock (then it was an outlier).
+    Far ahead is also a stamp that has advanced by more than the time of receipt.
     Depends on the order of events alone, so that a replay decides as the live run did.
     """
 
     def __init__(self, config: GateConfig) -> None:
-        self._newest_ns = 0  # of the accepted stamps
+        self._newest_ns = 0  # of the accepted stamps ...
+        self._received_ns = 0  # ... and when it was received
         self._started = False
         self._back_ns = int(config.clock_back_s * 1e9)
         self._jump_ns = int(config.clock_jump_s * 1e9)
@@ -50,8 +53,10 @@ class ClockGuard:
     def judge(self, event: Event) -> list[tuple[ClockVerdict, Event]]:
         """Verdicts that this event allows: on itself, on earlier ones that waited, on none yet."""
         ahead = event.stamp_ns - self._newest_ns
+        lead = ahead - max(event.received_ns - self._received_ns, 0)
         overtaken = ahead < 0 and event.stamp_ns > self._newest_of.get(event.topic, event.stamp_ns)
-        if not self._started or overtaken or -self._back_ns <= ahead <= max(_LEAP_NS, 4.0 * self._usual_ns):
+        usual = -self._back_ns <= ahead <= max(_LEAP_NS, 4.0 * self._usual_ns) and lead <= _LEAP_NS
+        if not self._started or overtaken or usual:
             outliers = [(ClockVerdict.OUTLIER, other) for other in self._unconfirmed]
             self._unconfirmed.clear()
             if not overtaken:
@@ -107,10 +112,10 @@ class ClockGuard:
     def _advance_to(self, event: Event) -> None:
         advance = event.stamp_ns - self._newest_ns if self._started else 0
         if advance < -self._back_ns:
-            self._newest_ns = event.stamp_ns
+            self._newest_ns, self._received_ns = event.stamp_ns, event.received_ns
         elif advance > 0 or not self._started:
             self._usual_ns += 0.1 * (min(advance, 2_000_000_000) - self._usual_ns)
-            self._newest_ns = event.stamp_ns
+            self._newest_ns, self._received_ns = event.stamp_ns, event.received_ns
         self._started = True
         self._motion = self._motion or isinstance(event, MotionEvent)
 

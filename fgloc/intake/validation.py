@@ -14,10 +14,11 @@ from fgloc.config import Config, GateConfig, camera_role
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
 from fgloc.sensors.checks import EMPTIED, Changes, FieldChecks
-from fgloc.types import Event, TransformEvent, TruthEvent
+from fgloc.types import Event, MotionEvent, TransformEvent, TruthEvent
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
 _MOST_NOTES, _LONGEST_NOTE = 40, 1000  # sentences, and characters of one
+_OTHER_FRAMES = 20  # messages, without one of the frames before: the publisher is another one from then on
 _LEAST_SCALE = 1e-3  # of a rate: no unit of angle is smaller
 
 
@@ -30,6 +31,10 @@ class _Topic:
     gaps: int = 0
     longest_gap_ns: int = 0
     back: bool = False  # the last stamp was far behind the newest
+    frames: tuple[str, ...] = ()  # of the messages that are used
+    other: tuple[str, ...] = ()  # frames that most of the others have ...
+    votes: int = 0  # ... and by how many more of those messages, since the last that is used
+    stray: int = 0  # messages rejected for their frames
 
 
 def reported_bounds(config: Config) -> GateConfig:
@@ -56,10 +61,11 @@ class EventValidator:
     - A part that cannot be used is NaN in the copy and the rest is kept. Odometry: ``position`` and ``orientation``, or
       ``linear`` and ``angular``. Joints: single entries of ``position``, ``velocity``, ``effort``. IMU:
       ``linear_acceleration``. Events without any usable part are rejected whole.
+    - Odometry or IMU of other frames than the topic's messages so far is rejected, until twenty running have the same.
     - Bad entries of sightings are taken out; if none is left the event is rejected. Bearings in [pi, 2 pi] are wrapped.
 
     ``rejections`` counts what was lost, by "sensor.reason". Sensors: odometry, command, joints, imu, image, sightings,
-    truth, transform. Reasons: stamp_zero, duplicate_stamp; non_finite, speed_bound, yaw_rate_bound, range_bound,
+    truth, transform. Reasons: stamp_zero, duplicate_stamp; frame; non_finite, speed_bound, yaw_rate_bound, range_bound,
     position_bound, quaternion, negative_variance, asymmetric_cov, indefinite_cov (of odometry with ``pose_`` or
     ``twist_`` before them); length, position_non_finite, velocity_non_finite, effort_non_finite, position_bound,
     wheel_rate_bound (joints); unavailable, acceleration (imu); empty, truncated (image); unknown_id,
@@ -106,6 +112,12 @@ class EventValidator:
                     "were given for radians; else raise expert.gate.max_yaw_rate"
                 )
         for name, topic in self._topics.items():
+            if topic.stray:
+                notes.append(
+                    f"{name}: {topic.stray} messages of other frames than {topic.frames!r} were rejected"[
+                        :_LONGEST_NOTE
+                    ]
+                )
             if topic.gaps:
                 notes.append(
                     f"{name}: {topic.gaps} silence(s) longer than {self._config.gap_s:g} s, "
@@ -127,7 +139,7 @@ class EventValidator:
             sensor = camera_role(self._named[event.topic], sensor)
         self._seen[sensor] += 1
         topic = self._topics.get(event.topic)
-        reason = self._stamp(event, topic)
+        reason = self._stamp(event, topic) or self._frame(event, topic)
         if not reason:
             checked = check(event)
             if not isinstance(checked, str):
@@ -159,11 +171,30 @@ class EventValidator:
         topic.back = not topic.back
         return ""
 
+    @staticmethod
+    def _frames(event: Event) -> tuple[str, ...]:
+        """Frames of a message of odometry or IMU; none of others, which may tell several apart by them."""
+        named = (getattr(event, name, "") for name in ("frame_id", "child_frame_id"))
+        return tuple(named) if isinstance(event, MotionEvent) else ()
+
+    def _frame(self, event: Event, topic: _Topic | None) -> str:
+        """Reason to reject the event for its frames, or ""."""
+        if topic is None or topic.frames == (frames := self._frames(event)):
+            return ""
+        if frames != topic.other and topic.votes == 0:
+            topic.other = frames
+        topic.votes += 1 if frames == topic.other else -1
+        if topic.votes >= _OTHER_FRAMES:
+            return ""
+        topic.stray += 1
+        return "frame"
+
     def _remember(self, event: Event, topic: _Topic | None) -> None:
         stamp = event.stamp_ns
         if topic is None:
             topic = self._topics[event.topic] = _Topic(stamp)
-        elif stamp > topic.newest_ns:
+        topic.frames, topic.votes = self._frames(event), 0
+        if stamp > topic.newest_ns:
             gap = stamp - topic.newest_ns
             if gap > self._config.gap_s * 1e9:
                 topic.gaps += 1

@@ -1,5 +1,7 @@
 """Rows of the table of faults that the gate, the stepper and the wheel motion answer for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from event_makers import (
@@ -278,6 +280,25 @@ def test_fault_18_a_sensor_that_lives_in_the_future():
     assert {step.segment for step in steps} == {0}
     assert target.rejections["sightings.future"] == len(tags)
     assert any("/tags" in note and "stamp_offset_s" in note for note in target.notes)
+
+
+def test_a_stray_stamp_is_in_the_future_even_where_messages_are_rare():
+    """Four usual intervals ahead are 0.8 s here; 50 ms of them have passed."""
+    odometries = [odometry(t, twist=(1.0, 0.0), received=t) for t in times(1, 10, 5)]
+    target = stepper()
+    check_steps(run(target, in_order_of_receipt(odometries, [odometry(6.1 + 0.55, received=6.1)])))
+    assert target.rejections == {"odometry.future": 1}
+
+
+def test_odometry_of_another_frame_is_rejected_until_its_publisher_is_another_one(gate):
+    of_another = [replace(odometry(1.05 + 0.1 * k, (0, 0, 0), (0, 0)), frame_id=f"odd{k % 2}") for k in range(40)]
+    own = [odometry(1.0 + 0.1 * k, (0.1 * k, 0, 0), (1.0, 0)) for k in range(40)]
+    for mine, other in zip(own, of_another, strict=True):
+        assert gate.check(mine) is mine
+        assert gate.check(other) is None
+    assert gate.rejections == {"odometry.frame": 40}
+    renamed = [replace(odometry(6.0 + 0.1 * k, (0, 0, 0), (0, 0)), frame_id="odom2") for k in range(30)]
+    assert [gate.check(event) is event for event in renamed] == 20 * [False] + 10 * [True]
 
 
 def test_fault_21_gap_of_all_sensors(gate):
