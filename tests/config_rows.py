@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from fgloc.config import CameraConfig, robot_file
+from fgloc.files.settings import level_of
 from fgloc_training.config import TrainConfig
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -41,7 +42,8 @@ def rows(section):
     if isinstance(section, tuple):
         yield from _rows_of_kinds(section)
         return
-    elsewhere = {key for base in section.__mro__[1:] if base in _OWN_TABLE for key in base.model_fields}
+    parents = [base.model_fields.items() for base in section.__mro__[1:] if base in _OWN_TABLE]
+    elsewhere = {key for fields in parents for key, field in fields if level_of(field) != "constant"}
     for name, field in section.model_fields.items():
         if _section(field) is None and name not in elsewhere:
             yield f"| `{name}` | {_default(field.default)} | {_meaning(field)} |"
