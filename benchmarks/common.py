@@ -1,12 +1,19 @@
-"""Parts that all benchmarks share: rows, the printed table, ``--quick`` and ``--json``."""
+"""Parts that all benchmarks share: folders, rows, the printed table, ``--quick`` and ``--json``."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SAMPLES = ROOT / "datasets" / "samples"
+MODELS = ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
+DATA = Path(os.environ.get("FGLOC_REAL_DATA", ROOT / "real-data"))
+"""Folder of recordings that others made."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,6 @@ thresholds were chosen; the other was not.
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -31,7 +30,7 @@ from unittest import mock
 import numpy as np
 import yaml
 
-from benchmarks.common import Row, main
+from benchmarks.common import DATA, SAMPLES, Row, main
 from benchmarks.field_recordings import RECORDINGS as FIELD
 from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import first_settings
@@ -59,15 +58,13 @@ from fgloc.types import (
     TruthEvent,
 )
 
-ROOT = Path(__file__).resolve().parent.parent
-REAL = Path(os.environ.get("FGLOC_REAL_DATA", ROOT.parent / "shared" / "data"))
 RECORDINGS = {
-    "installed_run": ROOT / "datasets" / "samples" / "installed_run" / "bag",
-    "first_run": ROOT / "datasets" / "samples" / "first_run" / "bag",
-    "duarte": REAL / "pioneer_aruco" / "duarte.bag",
-    "tb3_landmarks": REAL / "turtlebot3" / "rosbag2_2025_11_25-15_11_34",
-    "husky": REAL / "robot_localization_bags" / "test1.bag",
-    "tb3_imu": REAL / "turtlebot3" / "rosbag2_2025_11_06-17_25_46",
+    "installed_run": SAMPLES / "installed_run" / "bag",
+    "first_run": SAMPLES / "first_run" / "bag",
+    "duarte": DATA / "pioneer_aruco" / "duarte.bag",
+    "tb3_landmarks": DATA / "turtlebot3" / "rosbag2_2025_11_25-15_11_34",
+    "husky": DATA / "robot_localization_bags" / "test1.bag",
+    "tb3_imu": DATA / "turtlebot3" / "rosbag2_2025_11_06-17_25_46",
 }
 _MAPPED = ("turtlebot_aruco", "mrclam6_1")  # text: bags are made of them
 _ONLINE_S = 40.0  # of motion: what is not named by then is not named online
@@ -368,7 +365,7 @@ def bags() -> Iterator[tuple[str, Path]]:
     yield from ((name, bag) for name, bag in RECORDINGS.items() if bag.exists())
     with tempfile.TemporaryDirectory() as folder:
         for one in FIELD:
-            if one.name in _MAPPED and (REAL / one.source).exists():
+            if one.name in _MAPPED and (DATA / one.source).exists():
                 (Path(folder) / one.name).mkdir()
                 yield one.name, one.bag(Path(folder) / one.name)
 

@@ -26,9 +26,10 @@ from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from benchmarks.field_recordings import DATA, RECORDINGS
-from benchmarks.gross_recordings import MISTAKES, Mistake
-from benchmarks.gross_recordings import write as write_mistaken
+from benchmarks.common import DATA, ROOT, SAMPLES
+from benchmarks.field_recordings import RECORDINGS
+from benchmarks.gross import MISTAKES, Mistake
+from benchmarks.gross import write as write_mistaken
 from fgloc import LandmarkMap, Live, RunResult, load_config, load_map, run, se2
 from fgloc.ablation.failures import AnyFailure, corrupt, generators
 from fgloc.cli import app
@@ -42,8 +43,7 @@ from fgloc.sensors.maps import write_map
 from fgloc.types import Estimate, Event, FloatArray, Landmark
 from fgloc_datasets.bag import BagWriter
 
-SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
-_EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+_EXAMPLES = ROOT / "examples"
 Settings = dict[str, dict[str, Any]]
 Found = dict[str, Any]
 """What a case found by aspect: what is hashed; under "rows", poses with sigmas, for comparison by value."""

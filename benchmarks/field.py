@@ -40,9 +40,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import Row, main, not_run
+from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field_peers import Heard, hear, textbook
-from benchmarks.field_recordings import DATA, RECORDINGS, Recording
+from benchmarks.field_recordings import RECORDINGS, Recording
 from benchmarks.field_sheet import MODES, SHEET, SOUND, Mode, Outcome, false_findings, found, right_cause
 from benchmarks.replays import kept
 from fgloc import se2

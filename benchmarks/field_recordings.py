@@ -9,7 +9,6 @@ are put on `_EPOCH_S`, since the day is not stated.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +20,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from scipy.io import loadmat
 
+from benchmarks.common import DATA
 from fgloc import se2
 from fgloc.frames import yaw_quaternion
 from fgloc.sensors.maps import write_map
@@ -28,7 +28,6 @@ from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message, nanoseconds, new_bag, read_table, write_merged
 
-DATA = Path(os.environ.get("FGLOC_REAL_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 _EPOCH_S = 1_600_000_000.0
 Kind = Literal["map", "se2"]
 

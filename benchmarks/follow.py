@@ -11,30 +11,57 @@ pose that guided the robot, and how long it drove, without the learned motion: a
 With ``--corners`` the camera sends corners with a detector's noise (`fgloc_datasets.sim.camera`); nothing is rendered.
 Cases (`fgloc_datasets.sim.following.cases`): flat30 and flat20, waypoints 0.3 and 0.2 m apart on a grippy floor; ice,
 friction 0.1 everywhere; dark20, no images from 16 to 36 s, on ice; onewheel, the left encoder counts nothing in that
-time; moved, a marker is 0.5 m from where the map has it. Rows ``slope``, ``rough`` and ``flat.uneven_over_flat`` are
-described in `benchmarks.follow_ground`; ``--ground`` measures these alone. Finished drives are kept, so that an
-interrupted run goes on.
+time; moved, a marker is 0.5 m from where the map has it. Finished drives are kept by the hash of the sources, so
+that an interrupted run goes on.
+
+Ground that is not flat (``--ground`` measures these rows alone): one drive a seed and floor, estimated as it was
+recorded. On the slope the robot is guided by fgloc; over the rough field and on the level floor by the true pose, as
+only the estimate counts. Then the recording is run online, with ``estimator.ground`` uneven and flat, without the
+checks before a run.
+
+- ``slope.ate_mm``: mean distance in space from the truth; ``slope.nees_over_d``: NEES over 6 of the pose in space;
+  ``slope.pitch_deg``: rms error of the pitch; ``slope.height_mm``, ``slope.roll_deg`` likewise.
+- ``slope.flat_config_ate_over``: error in the plane of a flat configuration over that of an uneven one;
+  ``slope.flat_config_named``: share of these runs whose mistakes name the floor.
+- ``slope.track_mm``: mean distance of the true path from the waypoint path, both in the plane.
+- ``flat.uneven_over_flat``: on the level floor, error in the plane; ``flat.uneven_over_flat_time``: median time of an
+  update.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
+import os
+import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 
-from benchmarks import follow_ground
-from benchmarks.common import Row, main, not_run
-from benchmarks.follow_runs import Cell, Driven, run_all
+from benchmarks.common import ROOT, Row, main, not_run
+from benchmarks.recordings import cache_folder
+from fgloc.config import Config, load_config
+from fgloc.errors import FglocError
+from fgloc.evaluation.metrics import compute_metrics, match_result
+from fgloc.files.atomic import atomic_file
+from fgloc.runner import run
 from fgloc_datasets.sim.camera import RenderError
-from fgloc_datasets.sim.following import PoseName
+from fgloc_datasets.sim.following import PoseName, follow
+from fgloc_datasets.sim.following.cases import drive_of
 
 Split = Literal["validation", "test"]
 SEEDS: dict[Split, tuple[int, ...]] = {"validation": (141, 142, 143), "test": tuple(range(161, 171))}
 Key = tuple[str, PoseName]
-_Rows = Mapping[Key, Sequence[Driven]]
+_Rows = Mapping[Key, Sequence["Driven"]]
 _QUICK = ("flat30",)
 
 
@@ -83,9 +110,9 @@ def measure(
         return
     found: _Rows = {(case, pose): [driven[cells[seed, case, pose]] for seed in drawn] for case, pose in keys}
     if quick:
-        yield from not_run(follow_ground.IDS, "left out of a quick run")
+        yield from not_run(GROUND_IDS, "left out of a quick run")
     else:
-        yield from follow_ground.measure(drawn)
+        yield from ground(drawn)
     for w in rows:
         if w not in todo:
             yield not_run([w.id], "left out of a quick run")[0]
@@ -118,6 +145,208 @@ def _over(field: str) -> Callable[[str, Sequence[Sequence[Driven]]], Row]:
     return row
 
 
+# --- Drives along waypoints -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Cell:
+    """One drive."""
+
+    seed: int
+    case: str
+    pose: PoseName
+    corners: bool = False  # of markers, not images
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """Score of the drive (`fgloc_datasets.sim.following.loop.Score`), or the reason why it failed."""
+
+    track_mm: float = float("nan")
+    reached: float = 0.0
+    arrived: bool = False
+    pose_mm: float | None = None
+    seconds: float = float("nan")
+    failed: str = ""
+
+
+def run_all(cells: Sequence[Cell], jobs: int | None = None) -> dict[Cell, Driven]:
+    """All drives, from the cache or driven now."""
+    found: dict[Cell, Driven] = {}
+    began = time.monotonic()
+    with ProcessPoolExecutor(jobs or os.cpu_count() or 1, get_context("spawn")) as pool:
+        waiting = {pool.submit(kept_drive, cell): cell for cell in cells}
+        for job in as_completed(waiting):
+            found[waiting[job]] = job.result()
+            left = (time.monotonic() - began) * (len(cells) / len(found) - 1.0)
+            print(f"{len(found)} of {len(cells)} drives, {left:.0f} s left", file=sys.stderr, flush=True)
+    return found
+
+
+def kept_drive(cell: Cell) -> Driven:
+    """A drive from the cache, or driven now and put there."""
+    sees = "corners" if cell.corners else "images"
+    path = cache_folder() / "follow" / f"{cell.case}_{cell.pose}_{cell.seed}_{sees}_{source_hash()}.json"
+    if path.is_file():
+        return Driven(**json.loads(path.read_text(encoding="utf-8")))
+    made = _drive(cell)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as file:
+        json.dump(asdict(made), file)
+    print(f"  {cell.case} {cell.pose} {cell.seed}: {made}", file=sys.stderr, flush=True)
+    return made
+
+
+def _drive(cell: Cell) -> Driven:
+    try:
+        score = follow(drive_of(cell.case, cell.pose, cell.seed, "corners" if cell.corners else "images")).score
+    except FglocError as error:
+        return Driven(failed=str(error))
+    return Driven(score.track_mm, score.reached, score.arrived, score.pose_mm, score.seconds)
+
+
+@cache
+def source_hash() -> str:
+    """Hash of fgloc's sources and of this module."""
+    made = hashlib.sha256()
+    files = sorted(p for p in (ROOT / "fgloc").rglob("*") if p.suffix in (".py", ".safetensors", ".yaml"))
+    for path in [*files, Path(__file__)]:
+        made.update(path.relative_to(ROOT).as_posix().encode())
+        made.update(path.read_bytes())
+    return made.hexdigest()[:12]
+
+
+# --- Ground that is not flat ------------------------------------------------------------------------------------------
+
+
+_GUIDE: dict[str, PoseName] = {"slope": "fgloc", "rough": "truth", "level": "truth"}
+_FLAT_TOO = ("slope", "level")
+
+
+@dataclass(frozen=True, slots=True)
+class OnGround:
+    """OnGround of one drive; NaN: not measured."""
+
+    track_mm: float = float("nan")
+    ate_mm: float = float("nan")  # in space
+    plane_mm: float = float("nan")  # in the plane
+    nees_over_6: float = float("nan")
+    pitch_deg: float = float("nan")
+    roll_deg: float = float("nan")
+    height_mm: float = float("nan")
+    step_ms: float = float("nan")
+    flat_plane_mm: float = float("nan")
+    flat_step_ms: float = float("nan")
+    flat_named: float = float("nan")
+    failed: str = ""
+
+
+def measured(case: str, seed: int) -> OnGround:
+    """One drive's figures, from the cache or driven now."""
+    path = cache_folder() / "follow" / f"ground_{case}_{seed}_{source_hash()}.json"
+    if path.is_file():
+        return OnGround(**json.loads(path.read_text(encoding="utf-8")))
+    try:
+        made = _drive_on_ground(case, seed)
+    except FglocError as error:
+        made = OnGround(failed=str(error))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as file:
+        json.dump(asdict(made), file)
+    print(f"  {case} {seed}: {made}", file=sys.stderr, flush=True)
+    return made
+
+
+def _drive_on_ground(case: str, seed: int) -> OnGround:
+    with TemporaryDirectory() as place:
+        folder = Path(place) / "run"
+        drive = drive_of(case, _GUIDE[case], seed, "corners", always=True)
+        track_mm = follow(drive, folder).score.track_mm
+        config = load_config(folder / "robot.yaml")
+        found = {"track_mm": track_mm if _GUIDE[case] == "fgloc" else float("nan")} | _uneven(folder, config)
+        if case in _FLAT_TOO:
+            found |= _flat(folder, config)
+        return OnGround(**found)
+
+
+def _uneven(folder: Path, config: Config) -> dict[str, float]:
+    config = _on(config, "uneven")
+    result = run(folder / "bag", folder / "map.yaml", config, "online", check=False)
+    matched, metrics = match_result(result, config), compute_metrics(result, config)
+    assert matched is not None
+    assert metrics.ground is not None
+    assert metrics.ate_mean_m is not None
+    errors = matched.spatial_errors
+    assert errors is not None
+    return {
+        "ate_mm": 1e3 * float(np.linalg.norm(errors[:, :3], axis=1).mean()),
+        "plane_mm": 1e3 * metrics.ate_mean_m,
+        "nees_over_6": metrics.ground.nees_over_6,
+        "pitch_deg": metrics.ground.pitch_rmse_deg,
+        "roll_deg": metrics.ground.roll_rmse_deg,
+        "height_mm": 1e3 * metrics.ground.height_rmse_m,
+        "step_ms": float(np.median(result.step_ms)),
+    }
+
+
+def _flat(folder: Path, config: Config) -> dict[str, float]:
+    config = _on(config, "flat")
+    result = run(folder / "bag", folder / "map.yaml", config, "online", check=False)
+    metrics = compute_metrics(result, config)
+    assert metrics.ate_mean_m is not None
+    return {
+        "flat_plane_mm": 1e3 * metrics.ate_mean_m,
+        "flat_step_ms": float(np.median(result.step_ms)),
+        "flat_named": float(any("floor is not flat" in mistake for mistake in result.mistakes)),
+    }
+
+
+def _on(config: Config, ground: str) -> Config:
+    estimator = config.estimator.model_copy(update={"ground": ground})
+    return config.model_copy(update={"estimator": estimator})
+
+
+GROUND_ROWS: tuple[tuple[str, str, str, str], ...] = (  # id, case, figure, unit
+    ("slope.ate_mm", "slope", "ate_mm", "mm"),
+    ("slope.ate_plane_mm", "slope", "plane_mm", "mm"),
+    ("slope.nees_over_d", "slope", "nees_over_6", ""),
+    ("slope.pitch_deg", "slope", "pitch_deg", "°"),
+    ("slope.roll_deg", "slope", "roll_deg", "°"),
+    ("slope.height_mm", "slope", "height_mm", "mm"),
+    ("slope.flat_config_named", "slope", "flat_named", ""),
+    ("slope.track_mm", "slope", "track_mm", "mm"),
+    ("rough.ate_mm", "rough", "ate_mm", "mm"),
+    ("rough.nees_over_d", "rough", "nees_over_6", ""),
+)
+GROUND_RATIOS: tuple[tuple[str, str, str, str], ...] = (  # id, case, figure, over
+    ("slope.flat_config_ate_over", "slope", "flat_plane_mm", "plane_mm"),
+    ("flat.uneven_over_flat", "level", "plane_mm", "flat_plane_mm"),
+    ("flat.uneven_over_flat_time", "level", "step_ms", "flat_step_ms"),
+)
+GROUND_IDS = tuple(row[0] for row in (*GROUND_ROWS, *GROUND_RATIOS))
+
+
+def ground(seeds: Sequence[int]) -> Iterator[Row]:
+    """All rows over these seeds."""
+    drives = {case: [measured(case, seed) for seed in seeds] for case in _GUIDE}
+    for row_id, case, figure, unit in GROUND_ROWS:
+        yield _ground_row(row_id, drives[case], lambda d, f=figure: getattr(d, f), unit)  # type: ignore[misc]
+    for row_id, case, figure, over in GROUND_RATIOS:
+        kept = drives[case]
+        first, second = (np.array([getattr(d, name) for d in kept]) for name in (figure, over))
+        failed = next((d.failed for d in kept if d.failed), "")
+        value = None if failed else float(first.mean() / second.mean())
+        yield Row(row_id, value, None if failed else float(np.std(first / second)), len(kept), "", failed)
+
+
+def _ground_row(row_id: str, drives: Sequence[OnGround], figure: Callable[[OnGround], float], unit: str) -> Row:
+    failed = next((d.failed for d in drives if d.failed), "")
+    values = np.array([figure(d) for d in drives])
+    if failed:
+        return Row(row_id, None, None, len(drives), unit, failed)
+    return Row(row_id, float(values.mean()), float(values.std()), len(drives), unit)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--split", choices=("validation", "test"), default="test")
@@ -128,6 +357,6 @@ if __name__ == "__main__":
     known, rest = parser.parse_known_args()
     if known.ground:
         chosen = SEEDS[known.split][: known.seeds]
-        main(lambda quick: follow_ground.measure(chosen[:1] if quick else chosen), follow_ground.__doc__ or "", rest)
+        main(lambda quick: ground(chosen[:1] if quick else chosen), __doc__ or "", rest)
         raise SystemExit
     main(lambda quick: measure(quick, known.split, known.jobs, known.corners, known.seeds), __doc__ or "", rest)

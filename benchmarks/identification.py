@@ -37,8 +37,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.common import Row, main, not_run
-from benchmarks.recordings import DATA, MRCLAM
+from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.recordings import MRCLAM
 from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside

@@ -32,10 +32,10 @@ import numpy as np
 import yaml
 from scipy.special import betaincinv
 
-from benchmarks.common import Row, main, not_run
+from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field_recordings import RECORDINGS
 from benchmarks.installed import CASES
-from benchmarks.recordings import DATA, SEEDS, Take, load, prepare
+from benchmarks.recordings import SEEDS, Take, load, prepare
 from benchmarks.replays import failures, floor, replayed
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file

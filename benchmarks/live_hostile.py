@@ -1,6 +1,6 @@
 """Impossible messages on every input topic of a live run, and inputs that stop: `python -m benchmarks.live_hostile`.
 
-A robot drives in a circle among beacons (`benchmarks.live_streams`). Between its own messages others come on every
+A robot drives in a circle among beacons (`benchmarks.live`). Between its own messages others come on every
 topic, by the same publisher: invalid text, ±1e300, infinities and NaN, empty and huge arrays, frames of ever new names,
 stamps of the future, of the past and of none. They are decoded as those of the wire.
 
@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import Row, main
-from benchmarks.live_endurance import _resident_mb
-from benchmarks.live_streams import START_NS, circle, circle_config, circle_map, circle_truth
+from benchmarks.live import START_NS, circle, circle_config, circle_map, circle_truth, resident_mb
 from fgloc.config import Role, TopicsConfig
 from fgloc.live import Live
 from fgloc.recording.messages import Messages
@@ -213,7 +212,7 @@ def hostile(count: int, seconds: float) -> Iterator[Row]:
                 if k % (len(own) // 10) == 0:
                     live.wait()
                     gc.collect()
-                    memory_mb.append(_resident_mb())
+                    memory_mb.append(resident_mb())
             live.wait()
         except Exception as error:  # what is looked for
             crashes += 1

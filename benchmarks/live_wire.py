@@ -29,13 +29,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import Row, main
+from benchmarks.common import SAMPLES, Row, main
 from fgloc.config import load_config
 from fgloc.live.wire.participant import Participant, Sample
 from fgloc.runner import run
 from fgloc.types import FloatArray, IntArray
 
-_SAMPLES = Path(__file__).resolve().parent.parent / "datasets" / "samples"
 _NAMES = ("first_run", "installed_run")
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _PATIENCE_S = 30.0
@@ -168,15 +167,15 @@ def largest_difference_mm(heard: Heard, sample: Path) -> tuple[float, float]:
 def measure(quick: bool) -> Iterator[Row]:
     """Rows of the benchmark."""
     names, rate = (_NAMES[:1], 4.0) if quick else (_NAMES, 1.0)
-    runs = [live_run(_SAMPLES / name, 100 + (os.getpid() + k) % 100, rate) for k, name in enumerate(names)]
+    runs = [live_run(SAMPLES / name, 100 + (os.getpid() + k) % 100, rate) for k, name in enumerate(names)]
     load = os.getloadavg()[0]
-    equal = np.array([largest_difference_mm(heard, _SAMPLES / name) for heard, name in zip(runs, names, strict=True)])
+    equal = np.array([largest_difference_mm(heard, SAMPLES / name) for heard, name in zip(runs, names, strict=True)])
     yield Row("live.equal_mm", float(equal[:, 0].max()), n=len(runs), unit="mm")
     yield Row("live.equal_keyframes", float(equal[:, 1].min()), n=len(runs))
     yield from timing("live.", runs)
     yield Row("live.load", load)
     with _busy(_OTHERS):
-        yield from timing("live.busy_", [live_run(_SAMPLES / names[-1], 100 + (os.getpid() + len(names)) % 100, rate)])
+        yield from timing("live.busy_", [live_run(SAMPLES / names[-1], 100 + (os.getpid() + len(names)) % 100, rate)])
 
 
 def timing(prefix: str, runs: Sequence[Heard]) -> Iterator[Row]:

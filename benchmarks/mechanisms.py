@@ -45,12 +45,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from benchmarks.common import Row, main, not_run
+from benchmarks.common import ROOT, Row, main, not_run
 from benchmarks.installed import CASES as INSTALLED_CASES
 from benchmarks.installed import Cell as InstalledCell
 from benchmarks.installed import scores_of
 from benchmarks.mechanisms_off import BY_NAME, JOIN, MECHANISMS, Mechanism, together, watched
-from benchmarks.recordings import MRCLAM, ROOT, SEEDS, Recorded, Split, Take, changed, folder, load, prepare, robot
+from benchmarks.recordings import MRCLAM, SEEDS, Recorded, Split, Take, changed, folder, load, prepare, robot
 from benchmarks.replays import FAILURES, Replayed, failure, floor, kept, parallel, replayed
 from benchmarks.scores import Errors, Scores, errors, lost_share, named, slips
 from fgloc.ablation.failures import MovedMarker

@@ -7,7 +7,6 @@ set for all five. Values are means over the robots, spreads their standard devia
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import stills
-from benchmarks.common import Row, main, not_run
+from benchmarks.common import DATA, MODELS, SAMPLES, Row, main, not_run
 from fgloc import se2
 from fgloc.config import Config, config_of, load_config
 from fgloc.evaluation.metrics import compute_metrics
@@ -28,10 +27,7 @@ from fgloc.sensors.measurements import PointMeasurement
 from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc_datasets import mrclam, pioneer, turtlebot3
 
-_ROOT = Path(__file__).resolve().parent.parent
-_DATA = Path(os.environ.get("FGLOC_REAL_DATA", _ROOT.parent / "shared" / "data"))
-_MODELS = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
-_SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
+_SAMPLE = SAMPLES / "first_run"
 _MRCLAM_UNITS = {
     "ate_mean_m": "m",
     "yaw_mae_deg": "deg",
@@ -53,7 +49,7 @@ def measure(quick: bool) -> Iterator[Row]:
 
 
 def _with_data(name: str, ids: list[str], rows: Callable[[Path], Iterable[Row]]) -> Iterable[Row]:
-    folder = _DATA / name
+    folder = DATA / name
     return rows(folder) if folder.is_dir() else not_run(ids, f"no {folder}; set FGLOC_REAL_DATA")
 
 
@@ -66,7 +62,7 @@ def _mrclam(folder: Path, robots: Iterable[int]) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as scratch:
         for robot in robots:
             bag = mrclam.convert(folder, robot, Path(scratch) / f"robot{robot}")
-            config = _configured(bag, {"motion": {"model": _MODELS / f"without_robot{robot}.safetensors"}})
+            config = _configured(bag, {"motion": {"model": MODELS / f"without_robot{robot}.safetensors"}})
             for mode in ("batch", "online"):
                 metrics = compute_metrics(run(bag, find_beside(bag, "map.yaml"), config, mode), config)  # type: ignore[arg-type]
                 for key in _MRCLAM_UNITS:

@@ -26,6 +26,7 @@ import yaml
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
+from benchmarks.common import DATA, MODELS, ROOT
 from fgloc.config import Config, MarkersConfig, config_of, load_config
 from fgloc.files.atomic import atomic_file
 from fgloc.frames import BASE_NAMES, quaternion_yaw
@@ -44,11 +45,7 @@ Split = Literal["validation", "test"]
 Floor = Literal["unequal_radii", "patches", "slippery"]
 Variant = Literal["installed", "map5mm", "perfect", "found", "tour"]
 SEEDS: dict[Split, tuple[int, ...]] = {"validation": tuple(range(41, 46)), "test": tuple(range(61, 71))}
-ROOT = Path(__file__).resolve().parent.parent
-DATA = Path(os.environ.get("FGLOC_REAL_DATA", ROOT.parent / "shared" / "data"))
-"""Folder of recordings that others made."""
 MRCLAM = DATA / "mrclam6"
-MODELS = ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam"
 _DURATION_S, _FOUND_S, _TOUR_S = 80.0, 120.0, 180.0
 _ROBOTS_S = 200.0  # of each robot of MRCLAM 6
 _MAP_M = 0.005

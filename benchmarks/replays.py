@@ -25,7 +25,8 @@ from unittest.mock import patch
 import numpy as np
 from pydantic import TypeAdapter
 
-from benchmarks.recordings import ROOT, Floor, Recorded, cache_folder, moved_interval
+from benchmarks.common import ROOT
+from benchmarks.recordings import Floor, Recorded, cache_folder, moved_interval
 from fgloc.ablation.failures import AnyFailure, Kidnap, Lift, corrupt, generators
 from fgloc.config import Config
 from fgloc.errors import EstimatorError

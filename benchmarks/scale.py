@@ -30,15 +30,14 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from benchmarks.common import Row, main
+from benchmarks.common import ROOT, SAMPLES, Row, main
 from benchmarks.steps import Chain, World
 from fgloc import se2
 from fgloc.graph.batch import BatchSmoother, elimination_order, initial_values, solved, with_deep_stack
 from fgloc.graph.factors import INSTALLATION, LandmarkFactors, pose_key, sighting_factors
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 
-_ROOT = Path(__file__).resolve().parent.parent
-_SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
+_SAMPLE = SAMPLES / "first_run"
 _HOUR_S = 3600.0
 _LAP_S = 30.0  # of the recording that a long one is made of
 _READ = """\
@@ -96,7 +95,7 @@ def _processor_s(command: Sequence[str], cache: str) -> tuple[float, float]:
     """Processor seconds and largest memory [GB] of a process and its children."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     environment |= {"PYTHONPYCACHEPREFIX": cache, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment, cwd=_ROOT)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment, cwd=ROOT)
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in (0, 3):

@@ -15,14 +15,13 @@ import resource
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import gtsam
 import numpy as np
 
-from benchmarks.common import Row, main
+from benchmarks.common import MODELS, SAMPLES, Row, main
 from fgloc import se2
 from fgloc.config import config_of, load_config
 from fgloc.estimation.localizer import Localizer
@@ -42,9 +41,8 @@ from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Camera, ControlEvent, Event, FloatArray, Landmark, LandmarkMap
 
-_ROOT = Path(__file__).resolve().parent.parent
-_SAMPLE = _ROOT / "datasets" / "samples" / "first_run"
-_MODEL = _ROOT / "fgloc" / "sensors" / "learned" / "models" / "mrclam" / "all.safetensors"
+_SAMPLE = SAMPLES / "first_run"
+_MODEL = MODELS / "all.safetensors"
 _WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker that faces -x
 _T_BASE_CAM = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0]])
 _K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])

@@ -10,7 +10,6 @@ detect.corner_rms_px         difference of their corners
 
 from __future__ import annotations
 
-import os
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -23,8 +22,7 @@ from unittest.mock import patch
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from benchmarks.common import Row, main, not_run
-from benchmarks.equal_cases import SAMPLES
+from benchmarks.common import DATA, SAMPLES, Row, main, not_run
 from fgloc.config import MarkersConfig, load_config
 from fgloc.recording.reader import open_recording
 from fgloc.sensors.maps import load_map
@@ -35,7 +33,6 @@ from fgloc.types import FloatArray
 
 _ID = "stills.missed_ids"
 _SHOWN, _SHOWN_EVERY_NS = 5, 50_000_000
-_DEFAULT_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 _TUTORIAL_DICTIONARY = "opencv_aruco/tutorial_dict.yml"
 
 
@@ -93,14 +90,9 @@ def _detector(still: Still, folder: Path) -> MarkerDetector:
     return MarkerDetector(str(folder / still.dictionary) if own_file else still.dictionary, MarkersConfig())
 
 
-def missed_ids(folder: Path | None = None) -> list[tuple[str, int]]:
-    """File and id of every listed marker that is not found. The folder defaults to the real data's marker_images."""
-    return [(o.still.file, i) for o in outcomes(folder or _folder()) for i in o.missed]
-
-
 def measure(quick: bool) -> Iterator[Row]:
     """The row, after the table of photographs."""
-    folder = _folder()
+    folder = DATA / "marker_images"
     yield from _tracking(folder, quick)
     if not folder.is_dir():
         yield from not_run([_ID], f"{folder} is absent; set FGLOC_REAL_DATA")
@@ -171,10 +163,6 @@ def _timed(seconds: FloatArray, search_s: FloatArray, which: int) -> Iterator[No
         taken = time.thread_time() - start
     seconds[which] += taken
     search_s[which] += taken - edges_s
-
-
-def _folder() -> Path:
-    return Path(os.environ.get("FGLOC_REAL_DATA", _DEFAULT_DATA)) / "marker_images"
 
 
 def _image(path: Path) -> ImageEvent:

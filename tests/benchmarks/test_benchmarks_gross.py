@@ -6,8 +6,7 @@ import re
 
 import pytest
 
-from benchmarks.gross import names
-from benchmarks.gross_recordings import MISTAKES
+from benchmarks.gross import MISTAKES, names
 
 
 @pytest.mark.parametrize(

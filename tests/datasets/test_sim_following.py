@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from benchmarks import follow as benchmark
-from benchmarks.follow_runs import Driven
+from benchmarks.follow import Driven
 from fgloc import run, se2
 from fgloc.config import Config, load_config
 from fgloc.errors import ConfigError

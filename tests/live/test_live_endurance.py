@@ -12,8 +12,7 @@ import pytest
 from live_feed import PATIENCE_S, feed, live_in
 from robot_world import CAMERA, START_NS, World, beacons, config, room
 
-from benchmarks.live_endurance import run_of
-from benchmarks.live_streams import circle, circle_config, circle_map, mirrored, wrong_ids
+from benchmarks.live import circle, circle_config, circle_map, mirrored, run_of, wrong_ids
 from fgloc.estimation.pose_fit import PoseFit
 from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.run import LiveFacts, OnlineRun
@@ -216,7 +215,7 @@ def test_a_stream_faster_than_the_estimator_never_blocks_and_is_bounded(monkeypa
 
 @pytest.mark.slow
 def test_a_million_keyframes():
-    """Cost of the last tenth over the first, and memory: as `benchmarks.live_endurance` has it."""
+    """Cost of the last tenth over the first, and memory: as `benchmarks.live` has it."""
     seconds = np.zeros(_LONG)
     for k, (_, spent) in zip(
         range(_LONG), run_of(circle_config(), circle_map(), circle(_LONG / 5.0 + 20.0)), strict=False
