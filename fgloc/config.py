@@ -87,20 +87,20 @@ class WheelsConfig(Section):
         0.01,
         ge=0,
         le=0.5,
-        description="of both radii alike; estimated",
+        description="sigma of a scale that both radii share; estimated",
     )
-    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="of the track; estimated")
+    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="sigma of the track; estimated")
     time_offset_sigma_s: float = expert(
-        0.005, ge=0, le=1.0, description="s: of their clock against the gyro's; estimated"
+        0.005, ge=0, le=1.0, description="s: sigma of their clock against the gyro's; estimated"
     )
     yaw_per_m_sigma: float = expert(
         0.015,
         ge=0,
         le=1,
-        description="rad/m: of yaw_per_m; estimated",
+        description="rad/m: sigma of yaw_per_m; estimated",
     )
-    slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: of slowdown")
-    delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: of delay_s")
+    slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: sigma of slowdown")
+    delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: sigma of delay_s")
 
     @property
     def in_radians(self) -> bool:
@@ -114,8 +114,8 @@ class GyroConfig(Section):
     use: bool = expert(True, description="false: the gyro is not read")
     scale: float = expert(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: clockwise")
     yaw_per_sqrt_s: float = expert(0.002, ge=1e-6, le=10, description="rad/√s: noise of the integrated rate")
-    scale_sigma: float = expert(0.005, ge=0, le=0.5, description="of scale; estimated")
-    bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="rad/s: of the bias at the start")
+    scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of scale; estimated")
+    bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="rad/s: sigma of the bias at the start")
     tilt_sigma_rad: float = constant(
         0.0087,
         "mounting to half a degree",
@@ -152,17 +152,19 @@ class CameraConfig(Section):
     cx_px: float | None = expert(None, ge=-1e5, le=1e5, description="px: principal point; None: the calibration's")
     cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="px, likewise")
     k1: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; None: the calibration's")
-    k2: float | None = expert(None, ge=-100, le=100, description="likewise")
-    position_sigma_m: float = expert(0.003, ge=0, le=1.0, description="m: of the mounting, on each axis; estimated")
+    k2: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; None: the calibration's")
+    position_sigma_m: float = expert(
+        0.003, ge=0, le=1.0, description="m: sigma of the mounting, on each axis; estimated"
+    )
     rotation_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="rad: likewise, about each axis")
-    focal_sigma: float = expert(0.003, ge=0, le=0.5, description="of the focal length, as a share")
-    principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="px: of the principal point")
-    distortion_sigma: float = expert(0.005, ge=0, le=0.5, description="of k1 and k2")
+    focal_sigma: float = expert(0.003, ge=0, le=0.5, description="sigma of the focal length, as a share")
+    principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="px: sigma of the principal point")
+    distortion_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of k1 and k2")
     time_offset_sigma_s: float = expert(
         0.012,
         ge=0,
         le=1.0,
-        description="s: of its clock against the gyro's (else the wheels'); estimated",
+        description="s: sigma of its clock against the gyro's (else the wheels'); estimated",
     )
     time_jitter_s: float = constant(
         0.002,
@@ -203,13 +205,13 @@ class LandmarksConfig(Section):
     range_along_axis: bool = expert(False, description="the reported range is a depth along the sensor's axis")
     range_bias_m: float = expert(0.0, ge=-100, le=100, description="subtracted from the reported range")
     bearing_bias_rad: float = expert(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
-    range_scale_sigma: float = expert(0.005, ge=0, le=0.5, description="of range_scale; estimated")
-    bearing_bias_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="of bearing_bias_rad; estimated")
+    range_scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of range_scale; estimated")
+    bearing_bias_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="sigma of bearing_bias_rad; estimated")
     position_sigma_m: float = expert(
-        0.0, ge=0, le=1.0, description="m: of the mounting, ahead and to the left; estimated"
+        0.0, ge=0, le=1.0, description="m: sigma of the mounting, ahead and to the left; estimated"
     )
     time_offset_sigma_s: float = expert(
-        0.012, ge=0, le=1.0, description="s: of the sensor's clock against gyro or wheels; estimated"
+        0.012, ge=0, le=1.0, description="s: sigma of the sensor's clock against gyro or wheels; estimated"
     )
     yaw_sigma_rad: float | None = expert(
         None,
@@ -297,7 +299,7 @@ class MotionConfig(Section):
     )
     use: bool = expert(True, description="false: the model is not used")
     scale: float = expert(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
-    scale_sigma: float = expert(0.01, ge=0, le=0.5, description="of scale; estimated")
+    scale_sigma: float = expert(0.01, ge=0, le=0.5, description="sigma of scale; estimated")
     correlation: Literal["joint", "independent"] = expert(
         "joint", description="joint: decorrelated from the wheels; independent: for comparison"
     )
@@ -558,8 +560,8 @@ class MapConfig(Section):
 
     scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres per unit of positions")
     size_scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres per unit of the map's marker sizes")
-    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m: of a landmark, on each axis; estimated")
-    rotation_sigma_rad: float = expert(0.0087, ge=0, le=1.0, description="rad: of a marker, about each axis")
+    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m: sigma of a landmark, on each axis; estimated")
+    rotation_sigma_rad: float = expert(0.0087, ge=0, le=1.0, description="rad: sigma of a marker, about each axis")
 
 
 class EstimatorConfig(Section):

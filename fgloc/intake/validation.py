@@ -139,11 +139,12 @@ class EventValidator:
             sensor = camera_role(self._named[event.topic], sensor)
         self._seen[sensor] += 1
         topic = self._topics.get(event.topic)
-        reason = self._stamp(event, topic) or self._frame(event, topic)
+        frames = self._frames(event)
+        reason = self._stamp(event, topic) or self._frame(topic, frames)
         if not reason:
             checked = check(event)
             if not isinstance(checked, str):
-                self._remember(event, topic)
+                self._remember(event, topic, frames)
                 return checked
             reason = checked
         if reason != EMPTIED:  # its parts are counted already
@@ -177,9 +178,10 @@ class EventValidator:
         named = (getattr(event, name, "") for name in ("frame_id", "child_frame_id"))
         return tuple(named) if isinstance(event, MotionEvent) else ()
 
-    def _frame(self, event: Event, topic: _Topic | None) -> str:
-        """Reason to reject the event for its frames, or ""."""
-        if topic is None or topic.frames == (frames := self._frames(event)):
+    @staticmethod
+    def _frame(topic: _Topic | None, frames: tuple[str, ...]) -> str:
+        """Reason to reject a message of these frames, or ""."""
+        if topic is None or topic.frames == frames:
             return ""
         if frames != topic.other and topic.votes == 0:
             topic.other = frames
@@ -189,11 +191,11 @@ class EventValidator:
         topic.stray += 1
         return "frame"
 
-    def _remember(self, event: Event, topic: _Topic | None) -> None:
+    def _remember(self, event: Event, topic: _Topic | None, frames: tuple[str, ...]) -> None:
         stamp = event.stamp_ns
         if topic is None:
             topic = self._topics[event.topic] = _Topic(stamp)
-        topic.frames, topic.votes = self._frames(event), 0
+        topic.frames, topic.votes = frames, 0
         if stamp > topic.newest_ns:
             gap = stamp - topic.newest_ns
             if gap > self._config.gap_s * 1e9:

@@ -58,8 +58,8 @@ class UwbConfig(Section):
     tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
     sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
     bias_m: float = Field(0.0, ge=-10, le=10, description="m: subtracted from every range")
-    bias_sigma_m: float = Field(0.1, ge=0, le=10, description="of bias_m; estimated")
-    scale_sigma: float = Field(0.05, ge=0, le=0.5, description="of reported over true range; estimated")
+    bias_sigma_m: float = Field(0.1, ge=0, le=10, description="sigma of bias_m; estimated")
+    scale_sigma: float = Field(0.05, ge=0, le=0.5, description="sigma of reported over true range; estimated")
     non_line_of_sight: Literal["mixture", "reject"] = Field(
         "mixture", description="mixture: use too long ranges with nlos_*; reject: drop them"
     )

@@ -1,4 +1,4 @@
-"""What benchmarks share: recordings, failures and scores are right where the outcome is known."""
+"""Recordings, failures and scores of the benchmarks are right where the outcome is known."""
 
 from __future__ import annotations
 

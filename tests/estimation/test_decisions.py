@@ -1,4 +1,4 @@
-"""What decides does decide: each test is of one bound, weight or condition that other tests would not miss."""
+"""Bounds, weights and conditions of the estimator's decisions: a test fails where one of them is without effect."""
 
 from __future__ import annotations
 
