@@ -12,8 +12,10 @@ from fgloc.types import Event, MotionEvent, RawEvent, SightingsEvent
 
 # --- The common clock -------------------------------------------------------------------------------------------------
 
-_LEAP_NS = 500_000_000  # a stamp further ahead than this, and than four usual intervals, needs confirmation; also one
-# that is further ahead than this of what the time of receipt has advanced
+_LEAP_NS = (
+    500_000_000  # a stamp further ahead than this needs confirmation, unless it is by four usual intervals at most
+)
+# and not further ahead of its time of receipt, by as much, than any before
 _CONFIRM_COUNT = 3  # events that agree on a new time ...
 _CONFIRM_NS = 250_000_000  # ... over this span confirm it ...
 _CONFIRM_BACK_NS = 100_000_000  # ... and, of an earlier time, received over this: late messages come in a burst
@@ -35,13 +37,13 @@ class ClockGuard:
 
     A stamp far ahead of the newest or far behind it is kept in a bounded queue until others agree with it (the clock
     has jumped, or all sensors had a gap) or until one arrives that fits the running clock (then it was an outlier).
-    Far ahead is also a stamp that has advanced by more than the time of receipt.
-    Depends on the order of events alone, so that a replay decides as the live run did.
+    Where messages are rare, a stamp may be further ahead, but not of its own time of receipt by more than those before.
+    Depends on the events and their order alone, so that a replay decides as the live run did.
     """
 
     def __init__(self, config: GateConfig) -> None:
-        self._newest_ns = 0  # of the accepted stamps ...
-        self._received_ns = 0  # ... and when it was received
+        self._newest_ns = 0  # of the accepted stamps
+        self._lead_ns: int | None = None  # largest stamp less time of receipt, of those
         self._started = False
         self._back_ns = int(config.clock_back_s * 1e9)
         self._jump_ns = int(config.clock_jump_s * 1e9)
@@ -53,9 +55,9 @@ class ClockGuard:
     def judge(self, event: Event) -> list[tuple[ClockVerdict, Event]]:
         """Verdicts that this event allows: on itself, on earlier ones that waited, on none yet."""
         ahead = event.stamp_ns - self._newest_ns
-        lead = ahead - max(event.received_ns - self._received_ns, 0)
         overtaken = ahead < 0 and event.stamp_ns > self._newest_of.get(event.topic, event.stamp_ns)
-        usual = -self._back_ns <= ahead <= max(_LEAP_NS, 4.0 * self._usual_ns) and lead <= _LEAP_NS
+        early = self._lead_ns is not None and -_delay(event) - self._lead_ns > _LEAP_NS
+        usual = -self._back_ns <= ahead <= max(_LEAP_NS, 0.0 if early else 4.0 * self._usual_ns)
         if not self._started or overtaken or usual:
             outliers = [(ClockVerdict.OUTLIER, other) for other in self._unconfirmed]
             self._unconfirmed.clear()
@@ -101,6 +103,7 @@ class ClockGuard:
         jumped = not 0 <= first.stamp_ns - self._newest_ns <= self._jump_ns
         if jumped:
             self._motion = False
+            self._lead_ns = None
             self._newest_of.clear()
         self._advance_to(first)
         self._newest_of[first.topic] = first.stamp_ns
@@ -112,11 +115,12 @@ class ClockGuard:
     def _advance_to(self, event: Event) -> None:
         advance = event.stamp_ns - self._newest_ns if self._started else 0
         if advance < -self._back_ns:
-            self._newest_ns, self._received_ns = event.stamp_ns, event.received_ns
+            self._newest_ns = event.stamp_ns
         elif advance > 0 or not self._started:
             self._usual_ns += 0.1 * (min(advance, 2_000_000_000) - self._usual_ns)
-            self._newest_ns, self._received_ns = event.stamp_ns, event.received_ns
+            self._newest_ns = event.stamp_ns
         self._started = True
+        self._lead_ns = -_delay(event) if self._lead_ns is None else max(self._lead_ns, -_delay(event))
         self._motion = self._motion or isinstance(event, MotionEvent)
 
 
