@@ -123,7 +123,7 @@ def outcome(recording: Recording) -> Outcome:
         folder = Path(scratch)
         try:
             bag = recording.bag(folder)
-            ran = kept(f"field_{recording.name}", lambda: _commands(recording, bag, folder))
+            ran = ran_through(recording, bag, folder)
         except Exception as error:  # a recording that breaks is a row
             return Outcome(error=f"{type(error).__name__}: {error}")
         out = Outcome(
@@ -132,17 +132,20 @@ def outcome(recording: Recording) -> Outcome:
             {name: r["metrics"] for name, r in ran.items() if r.get("metrics")},
         )
         try:
-            heard = hear(bag, recording.truth)
-            places = recording.map_path(folder)
-            landmarks = {} if places is None else {i: k.position[:2] for i, k in load_map(places).landmarks.items()}
-            out.ate = _ates(recording, heard, landmarks, ran)
+            heard, landmarks = hear(bag, recording.truth), landmarks_of(recording, folder)
+            if heard.truth is not None:
+                out.ate = ates(recording, heard, estimates_of(recording, heard, landmarks, ran), bool(landmarks))
         except Exception as error:
             out.error = f"{type(error).__name__}: {error}"
     return out
 
 
+def ran_through(recording: Recording, bag: Path, folder: Path) -> Mapping[str, Any]:
+    """Exit code, output, time, poses and metrics of each command line, kept by the hash of the sources."""
+    return kept(f"field_{recording.name}", lambda: _commands(recording, bag, folder))
+
+
 def _commands(recording: Recording, bag: Path, folder: Path) -> dict[str, Any]:
-    """Exit code, output, time, poses and metrics of each command line."""
     config, found_map = folder / "init" / "robot.yaml", recording.map_path(folder)
     config.parent.mkdir()
     given = [str(bag), "--config", str(config), *([] if found_map is None else ["--map", str(found_map)])]
@@ -177,36 +180,46 @@ def _command(arguments: Sequence[str]) -> dict[str, Any]:
     return {"code": code, "said": _ESCAPES.sub("", said), "seconds": round(time.monotonic() - began, 1)}
 
 
-def _ates(
+def estimates_of(
     recording: Recording, heard: Heard, landmarks: Mapping[int, FloatArray], ran: Mapping[str, Any]
-) -> dict[str, float]:
-    truth = heard.truth
-    if truth is None or len(truth.stamps_ns) < 2:
-        return {}
+) -> dict[str, Trajectory]:
+    """Trajectories of odometry, of the textbook, and of the commands that were run."""
     estimates: dict[str, Trajectory] = {}
     if heard.odometry is not None:
         estimates["odometry"] = heard.odometry
-    given = landmarks if recording.frame == "map" else {}
-    if (plain := textbook(heard, given)) is not None:
+    if (plain := textbook(heard, landmarks)) is not None:
         estimates["textbook.online"], estimates["textbook.batch"] = plain
     for mode in MODES:
         if "poses" in ran[mode] and len(ran[mode]["poses"]) > 1:
             estimates[mode] = own = Trajectory(np.array(ran[mode]["stamps"]), np.array(ran[mode]["poses"]))
             begun = (int(own.stamps_ns[0]), own.poses[0])
-            if given and (plain := textbook(heard, given, begun)) is not None:
+            if landmarks and (plain := textbook(heard, landmarks, begun)) is not None:
                 estimates[f"alike.{mode}"] = plain[mode == "batch"]
+    return estimates
+
+
+def ates(recording: Recording, heard: Heard, estimates: Mapping[str, Trajectory], mapped: bool) -> dict[str, float]:
+    """ATE [m] of each estimate that covers half of the truth; ``mapped``: they are in the frame of a map."""
+    truth = heard.truth
+    assert truth is not None
     base = heard.odometry or estimates.get("batch") or estimates.get("online")
-    if base is None:
+    if len(truth.stamps_ns) < 2 or base is None:
         return {}
     at_ns = base.stamps_ns[np.r_[True, np.diff(base.stamps_ns // 100_000_000) > 0]]
     stampless = recording.truth.endswith("ground_pose")
     out = {}
     for name, estimate in estimates.items():
-        align = recording.frame == "se2" or name == "odometry" or not given
+        align = recording.frame == "se2" or name == "odometry" or not mapped
         value = ate(estimate, truth, at_ns, align, recording.lever, stampless)
         if math.isfinite(value):
             out[name] = value
     return out
+
+
+def landmarks_of(recording: Recording, folder: Path) -> dict[int, FloatArray]:
+    """Places ``(2,)`` of the map's landmarks where the truth is in its frame, by id; else none."""
+    path = recording.map_path(folder) if recording.frame == "map" else None
+    return {} if path is None else {i: k.position[:2] for i, k in load_map(path).landmarks.items()}
 
 
 # --- Rows -------------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -28,13 +28,40 @@ _STEP_NS = 100_000_000
 _HELD_S = 1.1  # a command holds no longer
 _EARTH_M_PER_DEG = 111_320.0
 _GLITCH_M = 0.1  # from the median of five neighbours, besides six times the usual
-_MOTION = np.array([0.02, 0.02, 0.05])  # m, m, rad per root second
-_SIGHTING = np.array([0.03, 0.1])  # rad, m
 _PRIOR = np.array([0.1, 0.1, 0.1])
 _HELD_M = 1e-3  # a landmark of the map
-_HUBER = 1.345
 _LANDMARKS = 1_000_000_000  # keys of landmarks are above those of poses
 _ERRORS = (RuntimeError, IndexError, ValueError)  # GTSAM's
+
+
+@dataclass(frozen=True, slots=True)
+class Constants:
+    """Sigmas of motion, growing with the root of time, and of a sighting; constant of a robust kernel [sigma].
+
+    Those of `textbook`'s default are what an engineer writes down before the first run: nobody tuned them.
+    """
+
+    motion_m: float = 0.02  # per root second
+    motion_rad: float = 0.05
+    bearing_rad: float = 0.03
+    range_m: float = 0.1
+    kernel: Literal["huber", "cauchy"] = "huber"
+    k: float = 1.345
+
+    def motion(self, seconds: float) -> Any:
+        """Noise of a motion over a time [s]."""
+        return gtsam.noiseModel.Diagonal.Sigmas(
+            np.array([self.motion_m, self.motion_m, self.motion_rad]) * np.sqrt(max(seconds, 1e-9))
+        )
+
+    def sighting(self) -> Any:
+        """Noise of bearing and range under the kernel."""
+        kernels = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}
+        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array([self.bearing_rad, self.range_m]))
+        return gtsam.noiseModel.Robust.Create(kernels[self.kernel].Create(self.k), sigmas)
+
+
+UNTUNED = Constants()
 
 
 @dataclass(slots=True)
@@ -110,10 +137,25 @@ def clean(stamps: IntArray, poses: FloatArray) -> Trajectory:
     return Trajectory(stamps, poses)
 
 
-def textbook(
+@dataclass(frozen=True, slots=True, eq=False)
+class Begun:
+    """Odometry ``(n,)`` at 10 Hz with the sightings of each pose (id, range [m], bearing [rad]), and the first pose."""
+
+    stamps: IntArray
+    poses: FloatArray
+    seen: list[list[tuple[int, float, float]]]
+    pose: FloatArray
+
+    def steps(self) -> list[tuple[float, FloatArray]]:
+        """Seconds and motion ``(3,)`` from each pose to the next."""
+        seconds = np.maximum(np.diff(self.stamps), 1) * 1e-9
+        return [(s, se2.between(a, b)) for s, a, b in zip(seconds.tolist(), self.poses, self.poses[1:], strict=False)]
+
+
+def begin(
     heard: Heard, landmarks: Mapping[int, FloatArray], begun: tuple[int, FloatArray] | None = None
-) -> tuple[Trajectory, Trajectory] | None:
-    """Online and smoothed poses of iSAM2 at odometry stamps; None without odometry or sightings.
+) -> Begun | None:
+    """Input of a baseline; None without odometry or sightings.
 
     Args:
         heard: content of the bag.
@@ -132,8 +174,21 @@ def textbook(
         if not len(stamps):
             return None
         pose = pose if begun else heard.truth.interpolate(int(stamps[0]))
-    kernel = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
-    noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Diagonal.Sigmas(_SIGHTING))
+    return Begun(stamps, poses, seen, pose)
+
+
+def textbook(
+    heard: Heard,
+    landmarks: Mapping[int, FloatArray],
+    begun: tuple[int, FloatArray] | None = None,
+    constants: Constants = UNTUNED,
+) -> tuple[Trajectory, Trajectory] | None:
+    """Online and smoothed poses of iSAM2 at odometry stamps; None without odometry or sightings. See `begin`."""
+    start = begin(heard, landmarks, begun)
+    if start is None:
+        return None
+    stamps, poses, seen, pose = start.stamps, start.poses, start.seen, start.pose
+    noise = constants.sighting()
     isam, known, online = gtsam.ISAM2(gtsam.ISAM2Params()), set[int](), []
     for k, stamp in enumerate(stamps.tolist()):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -141,8 +196,7 @@ def textbook(
             graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*pose), gtsam.noiseModel.Diagonal.Sigmas(_PRIOR)))
         else:
             step = se2.between(poses[k - 1], poses[k])
-            sigmas = _MOTION * np.sqrt(max(stamp - int(stamps[k - 1]), 1) * 1e-9)
-            motion = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            motion = constants.motion(max(stamp - int(stamps[k - 1]), 1) * 1e-9)
             graph.add(gtsam.BetweenFactorPose2(k - 1, k, gtsam.Pose2(*step), motion))
             pose = se2.compose(pose, step)
         values.insert(k, gtsam.Pose2(*pose))

@@ -1,0 +1,341 @@
+"""One bench for all programs: ``python -m benchmarks.public [--only NAME,...] [--page FILE.md] [--poses NAME=DIR]``.
+
+Recordings that others made, with truth and landmarks (`benchmarks.field_recordings`), go through ``fgloc init`` and
+fgloc with what it wrote, and the same messages through other programs. ATE is that of `benchmarks.field`.
+
+- ``fgloc``: ``smooth`` and ``online`` with defaults after ``init``.
+- ``odometry``: the robot's own, or its integrated commands.
+- ``isam2``: the textbook's iSAM2 of `benchmarks.field_peers`, online and smoothed, with the best constants of a search
+  along each of them in turn, on the recordings marked for development (least geometric mean of ATE over odometry).
+- ``gp``: batch with a white-noise-on-acceleration prior beside odometry and sightings, by GTSAM's
+  Levenberg-Marquardt; constants found likewise. Source: Anderson and Barfoot 2015, "Full STEAM ahead".
+- Others take part by their poses. ``--export DIR`` writes each recording as a bag with its ``map.yaml`` and ends;
+  ``--poses NAME=DIR`` reads ``DIR/RECORDING.tum`` into the same table. In a map's frame they are compared as they are.
+
+On a map the baselines start at the truth's first pose, which no user has: fgloc finds its own. ``--tune`` searches the
+constants and prints them. The simulator's recordings have a bench of their own (`benchmarks.peers`).
+
+- ``public.NAME.PROGRAM.{batch,online}.ate_m``
+- ``public.NAME.{batch,online}.best_over_fgloc``: least ATE of the others over fgloc's; below 1 fgloc loses.
+- ``public.{batch,online}.median_over_fgloc``, ``public.losses``: of all sets, and how many ratios are below 1.
+"""
+
+# ruff: noqa: E501 (lines of the page)
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.field import ates, landmarks_of, ran_through
+from benchmarks.field_peers import Begun, Constants, Heard, begin, hear, textbook
+from benchmarks.field_recordings import RECORDINGS, Recording
+from benchmarks.field_sheet import MODES, Mode
+from fgloc import se2
+from fgloc.files.atomic import atomic_file
+from fgloc.files.outputs import read_tum
+from fgloc.types import FloatArray, Trajectory
+
+COMPARED = tuple(r for r in RECORDINGS if r.truth and r.landmarks)
+_QUICK = ("duarte", "turtlebot_aruco")
+ISAM2 = Constants()
+GP = Constants()
+GP_ACCELERATION = np.array([0.5, 0.05, 1.0])  # m/s², m/s², rad/s² per root hertz
+_GRID: dict[str, tuple[Any, ...]] = {
+    "motion_m": (0.005, 0.01, 0.02, 0.05, 0.1),
+    "motion_rad": (0.01, 0.02, 0.05, 0.1),
+    "bearing_rad": (0.01, 0.03, 0.06),
+    "range_m": (0.03, 0.1, 0.2),
+    "kernel": ("huber", "cauchy"),
+}
+_LANDMARKS, _TWISTS = 1_000_000_000, 2_000_000_000  # keys of landmarks and of twists are above those of poses
+_START = np.array([0.1, 0.1, 0.1])  # m, m, rad
+_HELD_M = 1e-3  # a landmark of the map
+_ITERATIONS = 30
+
+
+# --- A motion prior in continuous time --------------------------------------------------------------------------------
+
+
+def smoothed(
+    heard: Heard,
+    landmarks: Mapping[int, FloatArray],
+    constants: Constants = GP,
+    acceleration: FloatArray = GP_ACCELERATION,
+) -> Trajectory | None:
+    """Poses of a batch whose acceleration is white noise, beside odometry and sightings; None without either.
+
+    Args:
+        heard: content of the bag.
+        landmarks: places ``(2,)`` of the map in the truth's frame; empty: they are variables from the origin on.
+        constants: noise of odometry and sightings.
+        acceleration: ``(3,)`` root of its power spectral density, along x, y and yaw of the robot.
+    """
+    start = begin(heard, landmarks)
+    if start is None or len(start.stamps) < 2:
+        return None
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    pose = start.pose
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*pose), gtsam.noiseModel.Diagonal.Sigmas(_START)))
+    values.insert(0, gtsam.Pose2(*pose))
+    poses = [pose]
+    for k, (seconds, step) in enumerate(start.steps()):
+        graph.add(gtsam.BetweenFactorPose2(k, k + 1, gtsam.Pose2(*step), constants.motion(seconds)))
+        graph.add(_white_acceleration(k, seconds, acceleration))
+        poses.append(pose := se2.compose(pose, step))
+        values.insert(k + 1, gtsam.Pose2(*pose))
+        values.insert(_TWISTS + k, se2.log(step) / seconds)
+    values.insert(_TWISTS + len(poses) - 1, np.zeros(3))
+    _add_sightings(graph, values, start, poses, landmarks, constants.sighting())
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(_ITERATIONS)
+    try:
+        found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    except (RuntimeError, IndexError, ValueError):  # GTSAM's
+        return None
+    return Trajectory(
+        start.stamps, np.array([(p.x(), p.y(), p.theta()) for p in map(found.atPose2, range(len(poses)))])
+    )
+
+
+def _add_sightings(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    start: Begun,
+    poses: Sequence[FloatArray],
+    landmarks: Mapping[int, FloatArray],
+    noise: Any,
+) -> None:
+    known: set[int] = set()
+    for k, seen in enumerate(start.seen):
+        for i, distance, bearing in seen:
+            key = _LANDMARKS + i
+            if i not in known:
+                known.add(i)
+                ahead = se2.compose(poses[k], (distance * np.cos(bearing), distance * np.sin(bearing), 0.0))[:2]
+                if landmarks:
+                    graph.add(gtsam.PriorFactorPoint2(key, landmarks[i], gtsam.noiseModel.Isotropic.Sigma(2, _HELD_M)))
+                values.insert(key, landmarks[i] if landmarks else ahead)
+            graph.add(gtsam.BearingRangeFactor2D(k, key, gtsam.Rot2(bearing), distance, noise))
+
+
+def _white_acceleration(k: int, seconds: float, acceleration: FloatArray) -> gtsam.CustomFactor:
+    """Prior between pose and twist k and the next ones; ref. Anderson and Barfoot 2015, equations 14 to 17, on SE(2)."""
+    Q = np.diag(acceleration**2)
+    cov = np.block([[seconds**3 / 3.0 * Q, seconds**2 / 2.0 * Q], [seconds**2 / 2.0 * Q, seconds * Q]])
+    noise = gtsam.noiseModel.Gaussian.Covariance(cov)
+
+    def error(_: Any, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+        a, b = values.atPose2(k), values.atPose2(k + 1)
+        v, w = values.atVector(_TWISTS + k), values.atVector(_TWISTS + k + 1)
+        between = a.between(b)
+        went = se2.log((between.x(), between.y(), between.theta()))
+        back = np.eye(3) + 0.5 * _ad(went)  # inverse right Jacobian, to first order
+        if jacobians is not None:
+            ahead = np.eye(3) - 0.5 * _ad(went)  # inverse left Jacobian
+            by_turn = -0.5 * _ad(w)
+            zero = np.zeros((3, 3))
+            jacobians[0] = np.vstack([-ahead, -by_turn @ ahead])
+            jacobians[1] = np.vstack([back, by_turn @ back])
+            jacobians[2] = np.vstack([-seconds * np.eye(3), -np.eye(3)])
+            jacobians[3] = np.vstack([zero, back])
+        return np.concatenate([went - seconds * v, back @ w - v])
+
+    return gtsam.CustomFactor(noise, [k, k + 1, _TWISTS + k, _TWISTS + k + 1], error)
+
+
+def _ad(x: FloatArray) -> FloatArray:
+    """Adjoint ``(3, 3)`` of a twist (vx, vy, ω)."""
+    return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [0.0, 0.0, 0.0]])
+
+
+# --- Programs ---------------------------------------------------------------------------------------------------------
+
+Programs = Callable[[Heard, Mapping[int, FloatArray]], dict[str, Trajectory]]
+
+
+def others(heard: Heard, landmarks: Mapping[int, FloatArray]) -> dict[str, Trajectory]:
+    """Trajectories of the baselines, by program and mode."""
+    found: dict[str, Trajectory] = {}
+    if heard.odometry is not None:
+        found |= {"odometry.online": heard.odometry, "odometry.batch": heard.odometry}
+    if (plain := textbook(heard, landmarks, constants=ISAM2)) is not None:
+        found["isam2.online"], found["isam2.batch"] = plain
+    if (batch := smoothed(heard, landmarks)) is not None:
+        found["gp.batch"] = batch
+    return found
+
+
+def compared(recording: Recording, poses: Mapping[str, Path]) -> dict[str, float]:
+    """ATE [m] of every program on a recording, by program and mode; those of no use are left out."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        bag = recording.bag(folder)
+        ran = ran_through(recording, bag, folder)
+        heard, landmarks = hear(bag, recording.truth), landmarks_of(recording, folder)
+    estimates = others(heard, landmarks)
+    for mode in MODES:
+        if len(ran[mode].get("poses", ())) > 1:
+            estimates[f"fgloc.{mode}"] = Trajectory(np.array(ran[mode]["stamps"]), np.array(ran[mode]["poses"]))
+    for program, tums in poses.items():
+        if (path := tums / f"{recording.name}.tum").is_file():
+            estimates |= dict.fromkeys((f"{program}.batch", f"{program}.online"), read_tum(path))
+    own = {name: e for name, e in estimates.items() if name.startswith("odometry.")}  # in a frame of its own always
+    rest = {name: e for name, e in estimates.items() if name not in own}
+    return ates(replace(recording, frame="se2"), heard, own, False) | ates(recording, heard, rest, bool(landmarks))
+
+
+def tune(recordings: Sequence[Recording]) -> None:
+    """Search the constants of the baselines along each in turn, and print them."""
+    given = []
+    for recording in recordings:
+        with tempfile.TemporaryDirectory() as scratch:
+            bag = recording.bag(Path(scratch))
+            given.append((recording, hear(bag, recording.truth), landmarks_of(recording, Path(scratch))))
+
+    def cost(program: str, constants: Constants) -> float:
+        logs = []
+        for recording, heard, landmarks in given:
+            plain = textbook(heard, landmarks, constants=constants) if program == "isam2" else None
+            batch = smoothed(heard, landmarks, constants) if program == "gp" else None
+            found = {"online": plain[0], "batch": plain[1]} if plain else {"batch": batch} if batch else {}
+            base = ates(
+                replace(recording, frame="se2"), heard, {"odometry": heard.odometry} if heard.odometry else {}, False
+            )
+            scores = ates(recording, heard, found, bool(landmarks))
+            logs += [math.log(scores.get(mode, 1e3) / base["odometry"]) for mode in (found or ("batch",))]
+        return float(np.exp(np.mean(logs)))
+
+    for program, best in (("isam2", ISAM2), ("gp", GP)):
+        least = cost(program, best)
+        for name, values in _GRID.items():
+            for value in values:
+                changed: dict[str, Any] = {name: value} | (
+                    {"k": 1.0 if value == "cauchy" else 1.345} if name == "kernel" else {}
+                )
+                if (tried := replace(best, **changed)) != best and (found := cost(program, tried)) < least:
+                    best, least = tried, found
+                print(f"{program} {changed}: least {least:.4f}", file=sys.stderr, flush=True)
+        print(f"{program}: {best}, ATE over odometry {least:.4f}")
+
+
+# --- Rows -------------------------------------------------------------------------------------------------------------
+
+
+def measure(quick: bool, only: Sequence[str], poses: Mapping[str, Path], page: Path | None) -> Iterator[Row]:
+    """Rows of the benchmark; a quick run has two recordings."""
+    if not DATA.is_dir():
+        yield from not_run(["public.losses"], f"no {DATA}; set FGLOC_REAL_DATA")
+        return
+    chosen = [r for r in COMPARED if r.name in (only or (_QUICK if quick else [x.name for x in COMPARED]))]
+    found = {}
+    for recording in chosen:
+        found[recording.name] = compared(recording, poses)
+        print(f"  {recording.name}: {found[recording.name]}", file=sys.stderr, flush=True)
+    ratios: dict[Mode, list[float]] = {mode: [] for mode in MODES}
+    for recording in chosen:
+        ate = found[recording.name]
+        for name, value in ate.items():
+            yield Row(f"public.{recording.name}.{name}.ate_m", value, unit="m")
+        for mode in MODES:
+            best = best_of(ate, mode)
+            if best is None or f"fgloc.{mode}" not in ate:
+                yield from not_run(
+                    [f"public.{recording.name}.{mode}.best_over_fgloc"], "no poses of fgloc, or of others"
+                )
+                continue
+            ratios[mode].append(ate[best] / ate[f"fgloc.{mode}"])
+            yield Row(f"public.{recording.name}.{mode}.best_over_fgloc", ratios[mode][-1], unit=best)
+    for mode, values in ratios.items():
+        if values:
+            yield Row(
+                f"public.{mode}.median_over_fgloc", float(np.median(values)), float(np.std(np.log(values))), len(values)
+            )
+    every = [value for values in ratios.values() for value in values]
+    yield Row("public.losses", float(sum(value < 1.0 for value in every)), n=len(every))
+    if page is not None:
+        write_page(page, chosen, found)
+
+
+def best_of(ate: Mapping[str, float], mode: Mode) -> str | None:
+    """Program and mode of the least ATE other than fgloc's; None: there is none."""
+    rivals = [name for name in ate if name.endswith(f".{mode}") and not name.startswith("fgloc.")]
+    return min(rivals, key=lambda name: ate[name], default=None)
+
+
+_HEAD = """# Public bench
+
+<!-- Written by `python -m benchmarks.public --page docs/public.md` on {day}. -->
+
+Recordings that others made, with truth and landmarks: ATE [m] of fgloc with defaults after `fgloc init`, and of other programs on the same messages, losses first.
+Programs, their constants and the error are described in `benchmarks/public.py`. Baselines start at the truth's first pose on a map; fgloc has to find its own. Constants of
+`isam2` and `gp` are the best on the recordings marked *dev*. Another program takes part by its poses (`--export`, `--poses`).
+
+| recording | mode | {programs} | best other / fgloc |
+|---|---|{dashes}---|
+"""
+
+
+def write_page(path: Path, chosen: Sequence[Recording], found: Mapping[str, Mapping[str, float]]) -> None:
+    """Write the table as Markdown, the least ratio first."""
+    programs = list(dict.fromkeys(name.rsplit(".", 1)[0] for ate in found.values() for name in ate))
+    programs.sort(key=lambda name: name != "fgloc")
+    rows = []
+    for recording in chosen:
+        ate = found[recording.name]
+        for mode in MODES:
+            best, own = best_of(ate, mode), ate.get(f"fgloc.{mode}", math.nan)
+            ratio = math.nan if best is None else ate[best] / own
+            cells = " | ".join(f"{ate[key]:.3f}" if (key := f"{name}.{mode}") in ate else "–" for name in programs)
+            name = f"{recording.name} *dev*" if recording.development else recording.name
+            rows.append(
+                (ratio, f"| {name} | {mode} | {cells} | {'no poses' if math.isnan(ratio) else f'{ratio:.2f}'} |")
+            )
+    rows.sort(key=lambda row: (not math.isnan(row[0]), row[0]))
+    head = _HEAD.format(
+        day=datetime.now(UTC).date().isoformat(), programs=" | ".join(programs), dashes="---|" * len(programs)
+    )
+    with atomic_file(path) as file:
+        file.write(head + "\n".join(line for _, line in rows) + "\n")
+
+
+def export(out: Path, only: Sequence[str]) -> None:
+    """Write each recording into a folder of its name: ``bag`` (as its format has it), ``map.yaml`` if there is one."""
+    for recording in (r for r in COMPARED if not only or r.name in only):
+        folder = out / recording.name
+        folder.mkdir(parents=True, exist_ok=True)
+        bag = recording.bag(folder)
+        if recording.make is None:
+            copy = shutil.copytree if bag.is_dir() else shutil.copy
+            copy(bag, folder / (bag.name if bag.is_file() else "bag"))
+        if (places := recording.map_path(folder)) is not None and places.parent != folder:
+            shutil.copy(places, folder / "map.yaml")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--only", default="", help="comma-separated names; default: all")
+    parser.add_argument("--page", type=Path, metavar="FILE.md", help="also write the table as a page")
+    parser.add_argument("--export", type=Path, metavar="DIR", help="write the recordings there and end")
+    parser.add_argument("--poses", action="append", default=[], metavar="NAME=DIR", help="another program's TUM files")
+    parser.add_argument("--tune", action="store_true", help="search the baselines' constants and end")
+    known, rest = parser.parse_known_args()
+    names = tuple(filter(None, known.only.split(",")))
+    if known.export is not None:
+        export(known.export, names)
+    elif known.tune:
+        tune([r for r in COMPARED if r.development and (not names or r.name in names)])
+    else:
+        programs = {name: Path(folder) for name, _, folder in (given.partition("=") for given in known.poses)}
+        main(lambda quick: measure(quick, names, programs, known.page), __doc__ or "", rest)
