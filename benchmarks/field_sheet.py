@@ -184,7 +184,7 @@ SHEET: tuple[Trap, ...] = (
     Trap("car_park", "GPS of a place without heading", r"truth\.no_yaw", r"/gps.*(not used|unused|no (role|sensor|yaw|heading))"),
     Trap("car_gnss", "no wheel odometry that can be read", "", r"no (wheel )?odometry|/speedsteer"),
     Trap("car_gnss", "GNSS is not used", "", r"/swiftnav.*(not used|unused|no (role|sensor))|NavSatFix"),
-    Trap("plaza", "ranges 7 % long", r"uwb\.\w+", rf"uwb\.range_scale.*{_NUMBER}", 0.935, 0.01),
+    Trap("plaza", "ranges 7 % long", r"uwb\.\w+", rf"uwb\.scale.*{_NUMBER}", 1.069, 0.01),
     Trap("plaza", "the truth's heading is the odometry's gyro", r"truth\.yaw_(from|is)\w+|yaw\.shared", r"truth.*yaw.*(same|odometry's)"),
     Trap("uwb_indoor", "ranges 0.07 to 0.15 m long", r"uwb\.\w+", rf"uwb\.bias_m.*{_NUMBER}", 0.11, 0.05),
     Trap("uwb_indoor", "wheels swapped, half the track", r"wheels\.(sign|turn)|yaw\.sign|truth\.yaw_sign", r"swapped|exchanged|mirror"),

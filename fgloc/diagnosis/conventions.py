@@ -16,6 +16,7 @@ from fgloc.diagnosis import gyro, landmarks, odometry, truth
 from fgloc.diagnosis.comparison import WHEELS, Conventions
 from fgloc.diagnosis.landmark_fits import Mounting, fit_sightings
 from fgloc.diagnosis.pairs import LAG_SIGMAS, LATE_S, TELLS, Figure, RateFit, fit_rate, varied, weighted
+from fgloc.diagnosis.ranges import check_ranges
 from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.diagnosis.truth import BodyFit
 from fgloc.types import FloatArray, LandmarkMap, Severity
@@ -49,6 +50,9 @@ def conventions(
     path = gyro.by_hand(found, path)
     driver = odometry.driver_late(found, path)
     turn = gyro.check_gyro(found, path)
+    by_ranges = check_ranges(found, path)
+    if by_ranges is not path:
+        path, turn = by_ranges, gyro.check_gyro(found, by_ranges) if found.opposite else turn
     if by_odometry is not None and driver is not None and (turn is None or turn.share < TELLS):
         late_s = Figure(by_odometry.late_s.value + driver.value, math.hypot(by_odometry.late_s.sigma, driver.sigma))
         turn = replace(by_odometry, late_s=late_s)

@@ -18,6 +18,7 @@ from fgloc.frames import quaternion_yaw
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.uwb import UwbEvent
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
@@ -129,6 +130,7 @@ class Signals:
         imu: rows of time, rates ``(3,)`` and specific forces ``(3,)`` as the driver reports them, whatever their unit.
         truth: rows of time, position ``(3,)`` and quaternion ``(4,)``.
         seen: rows of time, landmark and point ``(3,)``.
+        ranges: rows of time, anchor and range [m] by radio.
         spatial: whether the points of ``seen`` have three measured coordinates.
         widest: largest absolute bearing that was reported [rad]; 0 without bearings.
         images: whether the recording has images, which are not read here.
@@ -141,6 +143,7 @@ class Signals:
     imu: list[tuple[float, ...]] = field(default_factory=list)
     truth: list[tuple[float, ...]] = field(default_factory=list)
     seen: list[tuple[float, ...]] = field(default_factory=list)
+    ranges: list[tuple[float, int, float]] = field(default_factory=list)
     odometry: list[tuple[float, ...]] = field(default_factory=list)
     spatial: bool = False
     widest: float = 0.0
@@ -286,6 +289,8 @@ class SignalCollector:
             self.found.motion.append(passed)
         elif isinstance(passed, TruthEvent):
             self.found.truth.append((at_s, *passed.position.tolist(), *passed.orientation.tolist()))
+        elif isinstance(passed, UwbEvent):
+            self.found.ranges.append((at_s, passed.anchor, passed.range_m))
         elif isinstance(passed, SightingsEvent) and not passed.in_pixels:
             self.found.seen.extend(self._points(passed, at_s))
         return True

@@ -332,7 +332,7 @@ def check_body(found: Conventions, fit: BodyFit) -> None:
         lines["truth.yaw_offset_rad"] = round(float(T_base_body[2]), 4)
         what.append(f"is turned by {math.degrees(fit.yaw.value):+.1f} ± {math.degrees(fit.yaw.sigma):.1f}°")
     if any(off_place):
-        what.append(f"sits at {place[0]:+.2f}, {place[1]:+.2f} m")
+        what.append(f"sits at {place[0]:+z.2f}, {place[1]:+z.2f} m")
     if any(off_place) or section.offset_m != (0.0, 0.0):
         lines["truth.offset_m"] = [round(v, 3) + 0.0 for v in T_base_body[:2].tolist()]
     text = f"The body that the truth tracks {' and '.join(what)} in the robot's axes"

@@ -57,9 +57,10 @@ class UwbConfig(Section):
     )
     tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
     sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
+    scale: float = Field(1.0, ge=0.1, le=10, description="reported over true range, bias_m subtracted")
     bias_m: float = Field(0.0, ge=-10, le=10, description="m: subtracted from every range")
     bias_sigma_m: float = Field(0.1, ge=0, le=10, description="sigma of bias_m; estimated")
-    scale_sigma: float = Field(0.05, ge=0, le=0.5, description="sigma of reported over true range; estimated")
+    scale_sigma: float = Field(0.05, ge=0, le=0.5, description="sigma of scale; estimated")
     non_line_of_sight: Literal["mixture", "reject"] = Field(
         "mixture", description="mixture: use too long ranges with nlos_*; reject: drop them"
     )
@@ -261,7 +262,7 @@ class Uwb:
             stamp_ns=event.stamp_ns,
             cov=np.array([[config.sigma_m**2]]),
             target=event.anchor,
-            range_m=event.range_m - config.bias_m,
+            range_m=(event.range_m - config.bias_m) / config.scale,
             anchor=anchor,
             tag=self._tag,
         )
