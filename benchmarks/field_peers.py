@@ -137,30 +137,19 @@ def clean(stamps: IntArray, poses: FloatArray) -> Trajectory:
     return Trajectory(stamps, poses)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Begun:
-    """Odometry ``(n,)`` at 10 Hz with the sightings of each pose (id, range [m], bearing [rad]), and the first pose."""
-
-    stamps: IntArray
-    poses: FloatArray
-    seen: list[list[tuple[int, float, float]]]
-    pose: FloatArray
-
-    def steps(self) -> list[tuple[float, FloatArray]]:
-        """Seconds and motion ``(3,)`` from each pose to the next."""
-        seconds = np.maximum(np.diff(self.stamps), 1) * 1e-9
-        return [(s, se2.between(a, b)) for s, a, b in zip(seconds.tolist(), self.poses, self.poses[1:], strict=False)]
-
-
-def begin(
-    heard: Heard, landmarks: Mapping[int, FloatArray], begun: tuple[int, FloatArray] | None = None
-) -> Begun | None:
-    """Input of a baseline; None without odometry or sightings.
+def textbook(
+    heard: Heard,
+    landmarks: Mapping[int, FloatArray],
+    begun: tuple[int, FloatArray] | None = None,
+    constants: Constants = UNTUNED,
+) -> tuple[Trajectory, Trajectory] | None:
+    """Online and smoothed poses of iSAM2 at odometry stamps; None without odometry or sightings.
 
     Args:
         heard: content of the bag.
         landmarks: places ``(2,)`` of the map in the truth's frame; empty: they are variables from the origin on.
         begun: stamp [ns] and pose ``(3,)`` that it starts from on a map; None: the first of the truth.
+        constants: noise of odometry and sightings.
     """
     if heard.odometry is None or not heard.sightings:
         return None
@@ -174,20 +163,6 @@ def begin(
         if not len(stamps):
             return None
         pose = pose if begun else heard.truth.interpolate(int(stamps[0]))
-    return Begun(stamps, poses, seen, pose)
-
-
-def textbook(
-    heard: Heard,
-    landmarks: Mapping[int, FloatArray],
-    begun: tuple[int, FloatArray] | None = None,
-    constants: Constants = UNTUNED,
-) -> tuple[Trajectory, Trajectory] | None:
-    """Online and smoothed poses of iSAM2 at odometry stamps; None without odometry or sightings. See `begin`."""
-    start = begin(heard, landmarks, begun)
-    if start is None:
-        return None
-    stamps, poses, seen, pose = start.stamps, start.poses, start.seen, start.pose
     noise = constants.sighting()
     isam, known, online = gtsam.ISAM2(gtsam.ISAM2Params()), set[int](), []
     for k, stamp in enumerate(stamps.tolist()):

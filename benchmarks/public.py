@@ -7,8 +7,6 @@ fgloc with what it wrote, and the same messages through other programs. ATE is t
 - ``odometry``: the robot's own, or its integrated commands.
 - ``isam2``: the textbook's iSAM2 of `benchmarks.field_peers`, online and smoothed, with the best constants of a search
   along each of them in turn, on the recordings marked for development (least geometric mean of ATE over odometry).
-- ``gp``: batch with a white-noise-on-acceleration prior beside odometry and sightings, by GTSAM's
-  Levenberg-Marquardt; constants found likewise. Source: Anderson and Barfoot 2015, "Full STEAM ahead".
 - Others take part by their poses. ``--export DIR`` writes each recording as a bag with its ``map.yaml`` and ends;
   ``--poses NAME=DIR`` reads ``DIR/RECORDING.tum`` into the same table. In a map's frame they are compared as they are.
 
@@ -28,30 +26,27 @@ import math
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field import ates, landmarks_of, ran_through
-from benchmarks.field_peers import Begun, Constants, Heard, begin, hear, textbook
+from benchmarks.field_peers import Constants, Heard, hear, textbook
 from benchmarks.field_recordings import RECORDINGS, Recording
 from benchmarks.field_sheet import MODES, Mode
-from fgloc import se2
 from fgloc.files.atomic import atomic_file
 from fgloc.files.outputs import read_tum
 from fgloc.types import FloatArray, Trajectory
 
 COMPARED = tuple(r for r in RECORDINGS if r.truth and r.landmarks)
+_NONE_M = 1e3  # ATE of no poses
 _QUICK = ("duarte", "turtlebot_aruco")
-ISAM2 = Constants()
-GP = Constants()
-GP_ACCELERATION = np.array([0.5, 0.05, 1.0])  # m/s², m/s², rad/s² per root hertz
+ISAM2 = Constants(motion_m=0.005, motion_rad=0.01, bearing_rad=0.01, range_m=0.1, kernel="cauchy", k=1.0)
 _GRID: dict[str, tuple[Any, ...]] = {
     "motion_m": (0.005, 0.01, 0.02, 0.05, 0.1),
     "motion_rad": (0.01, 0.02, 0.05, 0.1),
@@ -59,110 +54,9 @@ _GRID: dict[str, tuple[Any, ...]] = {
     "range_m": (0.03, 0.1, 0.2),
     "kernel": ("huber", "cauchy"),
 }
-_LANDMARKS, _TWISTS = 1_000_000_000, 2_000_000_000  # keys of landmarks and of twists are above those of poses
-_START = np.array([0.1, 0.1, 0.1])  # m, m, rad
-_HELD_M = 1e-3  # a landmark of the map
-_ITERATIONS = 30
-
-
-# --- A motion prior in continuous time --------------------------------------------------------------------------------
-
-
-def smoothed(
-    heard: Heard,
-    landmarks: Mapping[int, FloatArray],
-    constants: Constants = GP,
-    acceleration: FloatArray = GP_ACCELERATION,
-) -> Trajectory | None:
-    """Poses of a batch whose acceleration is white noise, beside odometry and sightings; None without either.
-
-    Args:
-        heard: content of the bag.
-        landmarks: places ``(2,)`` of the map in the truth's frame; empty: they are variables from the origin on.
-        constants: noise of odometry and sightings.
-        acceleration: ``(3,)`` root of its power spectral density, along x, y and yaw of the robot.
-    """
-    start = begin(heard, landmarks)
-    if start is None or len(start.stamps) < 2:
-        return None
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    pose = start.pose
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*pose), gtsam.noiseModel.Diagonal.Sigmas(_START)))
-    values.insert(0, gtsam.Pose2(*pose))
-    poses = [pose]
-    for k, (seconds, step) in enumerate(start.steps()):
-        graph.add(gtsam.BetweenFactorPose2(k, k + 1, gtsam.Pose2(*step), constants.motion(seconds)))
-        graph.add(_white_acceleration(k, seconds, acceleration))
-        poses.append(pose := se2.compose(pose, step))
-        values.insert(k + 1, gtsam.Pose2(*pose))
-        values.insert(_TWISTS + k, se2.log(step) / seconds)
-    values.insert(_TWISTS + len(poses) - 1, np.zeros(3))
-    _add_sightings(graph, values, start, poses, landmarks, constants.sighting())
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(_ITERATIONS)
-    try:
-        found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    except (RuntimeError, IndexError, ValueError):  # GTSAM's
-        return None
-    return Trajectory(
-        start.stamps, np.array([(p.x(), p.y(), p.theta()) for p in map(found.atPose2, range(len(poses)))])
-    )
-
-
-def _add_sightings(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    start: Begun,
-    poses: Sequence[FloatArray],
-    landmarks: Mapping[int, FloatArray],
-    noise: Any,
-) -> None:
-    known: set[int] = set()
-    for k, seen in enumerate(start.seen):
-        for i, distance, bearing in seen:
-            key = _LANDMARKS + i
-            if i not in known:
-                known.add(i)
-                ahead = se2.compose(poses[k], (distance * np.cos(bearing), distance * np.sin(bearing), 0.0))[:2]
-                if landmarks:
-                    graph.add(gtsam.PriorFactorPoint2(key, landmarks[i], gtsam.noiseModel.Isotropic.Sigma(2, _HELD_M)))
-                values.insert(key, landmarks[i] if landmarks else ahead)
-            graph.add(gtsam.BearingRangeFactor2D(k, key, gtsam.Rot2(bearing), distance, noise))
-
-
-def _white_acceleration(k: int, seconds: float, acceleration: FloatArray) -> gtsam.CustomFactor:
-    """Prior between pose and twist k and the next ones; ref. Anderson and Barfoot 2015, equations 14 to 17, on SE(2)."""
-    Q = np.diag(acceleration**2)
-    cov = np.block([[seconds**3 / 3.0 * Q, seconds**2 / 2.0 * Q], [seconds**2 / 2.0 * Q, seconds * Q]])
-    noise = gtsam.noiseModel.Gaussian.Covariance(cov)
-
-    def error(_: Any, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        a, b = values.atPose2(k), values.atPose2(k + 1)
-        v, w = values.atVector(_TWISTS + k), values.atVector(_TWISTS + k + 1)
-        between = a.between(b)
-        went = se2.log((between.x(), between.y(), between.theta()))
-        back = np.eye(3) + 0.5 * _ad(went)  # inverse right Jacobian, to first order
-        if jacobians is not None:
-            ahead = np.eye(3) - 0.5 * _ad(went)  # inverse left Jacobian
-            by_turn = -0.5 * _ad(w)
-            zero = np.zeros((3, 3))
-            jacobians[0] = np.vstack([-ahead, -by_turn @ ahead])
-            jacobians[1] = np.vstack([back, by_turn @ back])
-            jacobians[2] = np.vstack([-seconds * np.eye(3), -np.eye(3)])
-            jacobians[3] = np.vstack([zero, back])
-        return np.concatenate([went - seconds * v, back @ w - v])
-
-    return gtsam.CustomFactor(noise, [k, k + 1, _TWISTS + k, _TWISTS + k + 1], error)
-
-
-def _ad(x: FloatArray) -> FloatArray:
-    """Adjoint ``(3, 3)`` of a twist (vx, vy, ω)."""
-    return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [0.0, 0.0, 0.0]])
 
 
 # --- Programs ---------------------------------------------------------------------------------------------------------
-
-Programs = Callable[[Heard, Mapping[int, FloatArray]], dict[str, Trajectory]]
 
 
 def others(heard: Heard, landmarks: Mapping[int, FloatArray]) -> dict[str, Trajectory]:
@@ -172,8 +66,6 @@ def others(heard: Heard, landmarks: Mapping[int, FloatArray]) -> dict[str, Traje
         found |= {"odometry.online": heard.odometry, "odometry.batch": heard.odometry}
     if (plain := textbook(heard, landmarks, constants=ISAM2)) is not None:
         found["isam2.online"], found["isam2.batch"] = plain
-    if (batch := smoothed(heard, landmarks)) is not None:
-        found["gp.batch"] = batch
     return found
 
 
@@ -197,37 +89,33 @@ def compared(recording: Recording, poses: Mapping[str, Path]) -> dict[str, float
 
 
 def tune(recordings: Sequence[Recording]) -> None:
-    """Search the constants of the baselines along each in turn, and print them."""
+    """Search the constants of `isam2` along each in turn, and print them."""
     given = []
     for recording in recordings:
         with tempfile.TemporaryDirectory() as scratch:
             bag = recording.bag(Path(scratch))
             given.append((recording, hear(bag, recording.truth), landmarks_of(recording, Path(scratch))))
 
-    def cost(program: str, constants: Constants) -> float:
+    def cost(constants: Constants) -> float:
         logs = []
         for recording, heard, landmarks in given:
-            plain = textbook(heard, landmarks, constants=constants) if program == "isam2" else None
-            batch = smoothed(heard, landmarks, constants) if program == "gp" else None
-            found = {"online": plain[0], "batch": plain[1]} if plain else {"batch": batch} if batch else {}
-            base = ates(
-                replace(recording, frame="se2"), heard, {"odometry": heard.odometry} if heard.odometry else {}, False
-            )
+            assert heard.odometry is not None
+            plain = textbook(heard, landmarks, constants=constants)
+            base = ates(replace(recording, frame="se2"), heard, {"odometry": heard.odometry}, False)["odometry"]
+            found = {} if plain is None else {"online": plain[0], "batch": plain[1]}
             scores = ates(recording, heard, found, bool(landmarks))
-            logs += [math.log(scores.get(mode, 1e3) / base["odometry"]) for mode in (found or ("batch",))]
+            logs += [math.log(scores.get(mode, _NONE_M) / base) for mode in MODES]
         return float(np.exp(np.mean(logs)))
 
-    for program, best in (("isam2", ISAM2), ("gp", GP)):
-        least = cost(program, best)
-        for name, values in _GRID.items():
-            for value in values:
-                changed: dict[str, Any] = {name: value} | (
-                    {"k": 1.0 if value == "cauchy" else 1.345} if name == "kernel" else {}
-                )
-                if (tried := replace(best, **changed)) != best and (found := cost(program, tried)) < least:
-                    best, least = tried, found
-                print(f"{program} {changed}: least {least:.4f}", file=sys.stderr, flush=True)
-        print(f"{program}: {best}, ATE over odometry {least:.4f}")
+    best = Constants()
+    least = cost(best)
+    for name, values in _GRID.items():
+        for value in values:
+            changed: dict[str, Any] = {name: value} | ({"k": 1.0} if value == "cauchy" else {})
+            if (tried := replace(best, **changed)) != best and (found := cost(tried)) < least:
+                best, least = tried, found
+            print(f"{changed}: least {least:.4f}", file=sys.stderr, flush=True)
+    print(f"{best}: ATE over odometry {least:.4f}")
 
 
 # --- Rows -------------------------------------------------------------------------------------------------------------
@@ -280,7 +168,7 @@ _HEAD = """# Public bench
 
 Recordings that others made, with truth and landmarks: ATE [m] of fgloc with defaults after `fgloc init`, and of other programs on the same messages, losses first.
 Programs, their constants and the error are described in `benchmarks/public.py`. Baselines start at the truth's first pose on a map; fgloc has to find its own. Constants of
-`isam2` and `gp` are the best on the recordings marked *dev*. Another program takes part by its poses (`--export`, `--poses`).
+`isam2` are the best on the recordings marked *dev*. Another program takes part by its poses (`--export`, `--poses`).
 
 | recording | mode | {programs} | best other / fgloc |
 |---|---|{dashes}---|
@@ -329,7 +217,7 @@ if __name__ == "__main__":
     parser.add_argument("--page", type=Path, metavar="FILE.md", help="also write the table as a page")
     parser.add_argument("--export", type=Path, metavar="DIR", help="write the recordings there and end")
     parser.add_argument("--poses", action="append", default=[], metavar="NAME=DIR", help="another program's TUM files")
-    parser.add_argument("--tune", action="store_true", help="search the baselines' constants and end")
+    parser.add_argument("--tune", action="store_true", help="search the constants of isam2 and end")
     known, rest = parser.parse_known_args()
     names = tuple(filter(None, known.only.split(",")))
     if known.export is not None:
