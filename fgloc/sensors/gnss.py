@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from fgloc.config import GateConfig, Section
-from fgloc.sensors.base import Context, Stream, When
+from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, SensorEvent
@@ -173,6 +173,32 @@ class Multipath(EventFailure):
         return move
 
 
+# --- First settings ---------------------------------------------------------------------------------------------------
+
+_FIRST = 10  # positions whose median is proposed for the origin
+
+
+def _first_section(look: FirstLook) -> FirstSection:
+    """A proposal for the origin, for the user to take: how far positions may be trusted is not told by a recording."""
+    passed = (check(event, GateConfig()) for event in look.events[GnssEvent] if isinstance(event, GnssEvent))
+    fixes = [event for event in passed if isinstance(event, GnssEvent)]
+    if not fixes:
+        return FirstSection()
+    about = np.median([(e.latitude, e.longitude, e.altitude) for e in fixes[:_FIRST]], axis=0)
+    altitude = float(about[2]) if math.isfinite(about[2]) else 0.0
+    lines = (
+        "gnss:",
+        "  # Positions are used once the origin of the map is given; these are the first ones. Receivers err alike for",
+        "  # a minute, by more than they say: sigma_scale 5 is a cautious start.",
+        f"  # origin: [{about[0]:.8f}, {about[1]:.8f}, {altitude:.2f}]  # latitude, longitude [°], altitude [m]",
+        "  # sigma_scale: 5.0",
+        "  # antenna: [0.0, 0.0]  # x y [m] in the base frame; else tf, else the base",
+    )
+    return FirstSection(
+        lines, ("where on the earth the map's origin is, without which GNSS is not used (gnss.origin)",)
+    )
+
+
 # --- The sensor -------------------------------------------------------------------------------------------------------
 
 
@@ -188,6 +214,7 @@ class Gnss:
         ),
     )
     failures: ClassVar[tuple[type[Section], ...]] = (Multipath,)
+    first_settings: ClassVar[FirstSettings] = FirstSettings((GnssEvent,), _first_section)
 
     def __init__(self, context: Context) -> None:
         self._config: GnssConfig = context.section
