@@ -87,6 +87,7 @@ _COMMANDS: tuple[tuple[str, Callable[..., None], tuple[str, ...]], ...] = (  # w
     ("live", live.live, ("fgloc live --map map.yaml --config robot.yaml --state run.state",)),
     ("play", live.play, ("fgloc play run.bag",)),
     ("evaluate", runs.evaluate, ("fgloc evaluate results/trajectory.tum results/truth.tum --align se2",)),
+    ("compare", runs.compare, ("fgloc compare batch online --figure both.png",)),
     ("export", runs.export, ("fgloc export results --mcap run.mcap",)),
     ("map", robot.make_map, ("fgloc map tour.bag --dictionary DICT_4X4_50 --size 0.2 --out map.yaml",)),
     (

@@ -404,3 +404,31 @@ def evaluate(
         ("RPE per metre, yaw", "-" if relative is None else f"{relative.rotation_deg:.6f} deg"),
     ]
     say_table(None, rows)
+
+
+def compare(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR", file_okay=False, help="results of smooth or online, two or more")
+    ],
+    figure: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="draw ways and distances; by its ending png, svg or pdf"),
+    ] = None,
+) -> None:
+    """Compare finished runs of one recording. All distances are from the first one's poses."""
+    from fgloc.evaluation.compare import HEAD, plot_comparison
+    from fgloc.evaluation.compare import compare as held
+    from fgloc.evaluation.style import FORMATS, image_of
+    from fgloc.files.outputs import write_bytes
+
+    if len(folders) < 2:
+        raise typer.BadParameter(f"got {len(folders)} folder, expected two or more", param_hint="DIR")
+    form = next((f for f in FORMATS if figure is not None and figure.suffix == f".{f}"), None)
+    if figure is not None and form is None:
+        raise typer.BadParameter(f"{figure.name!r} does not end in .png, .svg or .pdf", param_hint="--figure")
+    runs = held(folders)
+    say_table(HEAD, [run.row() for run in runs])
+    if figure is not None and form is not None:
+        check_out(figure, folder=False)
+        write_bytes(figure, image_of(plot_comparison(runs), form))
+        say(f"figure: {figure}")

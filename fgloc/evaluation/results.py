@@ -27,7 +27,7 @@ _PLANAR = (0, 1, 5)  # of x, y, z, roll, pitch, yaw
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Results:
-    """A run as its folder has it; a truth is not written into it.
+    """A run as its folder has it; its truth, in a frame of its own, is not read.
 
     Attributes:
         folder: where it was read from.

@@ -313,3 +313,27 @@ def test_a_single_recording_or_one_without_commands_cannot_be_trained_on(tmp_pat
     assert code == 1
     assert "no commands" in err
     assert not (tmp_path / "train.yaml").exists()
+
+
+# --- compare ----------------------------------------------------------------------------------------------------------
+
+
+def test_finished_runs_are_compared_with_each_other_and_with_the_truth(bag, tmp_path):
+    for name, mode in (("a", "smooth"), ("b", "online")):
+        assert fgloc(mode, bag, "--map", bag.parent / "map.yaml", "--out", tmp_path / name)[0] in (0, 3)
+    code, out, _ = fgloc("compare", tmp_path / "a", tmp_path / "b", "--figure", tmp_path / "both.svg")
+    assert code == 0
+    head, first, second, *_ = out.splitlines()
+    assert head.split()[0] == "run"
+    assert (first.split()[0], second.split()[0]) == ("a", "b")
+    assert first.split()[-1] == "-"
+    assert 0.0 <= float(second.split()[-1]) < 0.5
+    assert (tmp_path / "both.svg").read_bytes().startswith(b"<?xml")
+
+
+@pytest.mark.parametrize("arguments", [("a",), ("a", "b", "--figure", "both.txt")])
+def test_what_cannot_be_compared_is_a_usage_error(tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    code, _, _ = fgloc("compare", *arguments)
+    assert code == 2
+    assert list(tmp_path.iterdir()) == []

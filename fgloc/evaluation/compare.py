@@ -1,0 +1,142 @@
+"""Finished runs side by side: one table, and one figure of their ways and of how far they are apart."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fgloc import se2
+from fgloc.errors import TrajectoryError
+from fgloc.evaluation.metrics import match, matchable
+from fgloc.evaluation.results import Results, read_results
+from fgloc.evaluation.style import BLUE, GREEN, GREY, NORMAL, ORANGE, RED, SKY, WIDTH, broken, legend, plain_label, tidy
+from fgloc.files.outputs import read_tum
+from fgloc.types import FloatArray, IntArray, Mode, Trajectory
+
+HEAD = (
+    "run",
+    "keyframes",
+    "ATE mean [m]",
+    "ATE rmse [m]",
+    "yaw MAE [deg]",
+    "NEES/3",
+    "not OK",
+    "findings",
+    "apart [m]",
+)
+_COLORS = (BLUE, RED, GREEN, ORANGE, SKY)
+_BRIDGED_S = 1.0  # between two poses of the first run
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """A finished run beside the first one.
+
+    Attributes:
+        name: of its folder, as short as it tells the runs apart.
+        results: as they were read.
+        truth: in the run's frame, at stamps ``(m,)`` with poses ``(m, 3)``; None: the folder has none.
+        apart: distances ``(k,)`` [m] from the first run at stamps ``(k,)``.
+    """
+
+    name: str
+    results: Results
+    truth: Trajectory | None
+    apart_ns: IntArray
+    apart: FloatArray
+
+    def row(self) -> tuple[str, ...]:
+        """Cells of `HEAD`."""
+        m = self.results.metrics
+        named = Counter(str(f.get("severity", "")) for f in m.get("findings", ()))
+        off = sum(mode is not Mode.OK for mode in self.results.modes) / max(len(self.results.modes), 1)
+        rms = "-" if not len(self.apart) else f"{np.sqrt(np.mean(self.apart**2)):.4f}"
+        figures = (("ate_mean_m", ".4f"), ("ate_rmse_m", ".4f"), ("yaw_mae_deg", ".3f"), ("nees_over_3", ".2f"))
+        cells = ["-" if m.get(key) is None else format(float(m[key]), form) for key, form in figures]
+        grave = ", ".join(f"{named[s]} {s}" for s in ("error", "warning") if named[s]) or "-"
+        return self.name, str(len(self.results.trajectory)), *cells, f"{100.0 * off:.1f} %", grave, rms
+
+
+def compare(folders: Sequence[Path]) -> list[Compared]:
+    """Read finished runs, and hold each against the first.
+
+    Raises:
+        TrajectoryError: a folder is not that of a finished run.
+    """
+    read = [read_results(folder) for folder in folders]
+    return [_held(name, one, read[0]) for name, one in zip(_names(folders), read, strict=True)]
+
+
+def _held(name: str, one: Results, first: Results) -> Compared:
+    base, own = first.trajectory, one.trajectory
+    k = matchable(own, base, _BRIDGED_S) if one is not first else np.array([], dtype=np.int64)
+    apart = np.zeros(0)
+    if len(k):
+        there = se2.interpolate(base.stamps_ns, base.poses, own.stamps_ns[k])
+        apart = np.hypot(*(own.poses[k] - there)[:, :2].T)
+    return Compared(name, one, _truth(one), own.stamps_ns[k], apart)
+
+
+def _truth(one: Results) -> Trajectory | None:
+    """Truth beside a run, in the frame in which the run compared it."""
+    path = one.folder / "truth.tum"
+    if not path.is_file():
+        return None
+    config: Any = one.provenance.get("config")
+    settings = config.get("truth", {}) if isinstance(config, dict) else {}
+    align: Literal["none", "se2"] = "se2" if settings.get("align") == "se2" else "none"
+    truth = read_tum(path)
+    try:
+        T_map_truth = match(one.trajectory, truth, align, float(settings.get("max_gap_s", 0.2))).T_map_truth
+    except TrajectoryError:  # they share no time
+        return None
+    return Trajectory(truth.stamps_ns, se2.compose_array(T_map_truth, truth.poses))
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Ends of paths, with as many parts as tell them apart."""
+    parts = [folder.resolve().parts for folder in folders]
+    for n in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(p[-n:]) for p in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [str(folder) for folder in folders]
+
+
+def plot_comparison(runs: Sequence[Compared]) -> Figure:
+    """Ways of the runs, and below their distances from the truth, or from the first run where there is none."""
+    figure = Figure((WIDTH, 1.35 * WIDTH), layout="constrained")
+    way, error = figure.subplots(2, 1, height_ratios=(3, 1))
+    truth = next((run.truth for run in runs if run.truth is not None), None)
+    handles = []
+    if truth is not None:
+        xy = broken(truth.stamps_ns, truth.poses[:, :2])
+        handles += way.plot(*xy.T, color=GREY, lw=3.0, alpha=0.5, label="truth")
+    start = min(int(run.results.trajectory.stamps_ns[0]) for run in runs)
+    for run, color in zip(runs, (_COLORS[i % len(_COLORS)] for i in range(len(runs))), strict=True):
+        own = run.results.trajectory
+        handles += way.plot(
+            *broken(own.stamps_ns, own.poses[:, :2]).T, color=color, lw=1.2, label=plain_label(run.name)
+        )
+        stamps, off = run.apart_ns, run.apart
+        if run.truth is not None and len(k := matchable(own, run.truth, _BRIDGED_S)):
+            true = se2.interpolate(run.truth.stamps_ns, run.truth.poses, own.stamps_ns[k])
+            stamps, off = own.stamps_ns[k], np.hypot(*(own.poses[k] - true)[:, :2].T)
+        if len(stamps):
+            times = broken(stamps, np.column_stack([(stamps - start) * 1e-9, off]))
+            error.plot(*times.T, color=color, lw=1.0)
+    way.set_aspect("equal", adjustable="datalim")
+    way.set_xlabel("x [m]", fontsize=NORMAL)
+    way.set_ylabel("y [m]", fontsize=NORMAL)
+    error.set_xlabel("time [s]", fontsize=NORMAL)
+    error.set_ylabel(f"distance from {'the truth' if truth is not None else 'the first run'} [m]", fontsize=NORMAL)
+    for axes in (way, error):
+        tidy(axes)
+    legend(figure, handles)
+    return figure
