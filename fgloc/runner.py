@@ -173,7 +173,8 @@ def run(
     smoothed = _smoothed(parts, outcome) if mode == "batch" else None
     all_estimates = replay.estimates if smoothed is None else smoothed.estimates
     estimates = last_pass(all_estimates)
-    sane = parts.sanity.judge(estimates, causal=mode == "online")
+    held = parts.localizer.tracking.initial_pose_conflict is not None
+    sane = parts.sanity.judge(estimates, causal=mode == "online", held=held)
     installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
     found = installation_found(parts, outcome.roles, installed)
     contradiction = _contradiction(parts) if smoothed is None else smoothed.contradiction

@@ -83,6 +83,7 @@ _SPANS_TOLD = 5
 _WORST = 10.0  # most that a contradicted odometry's sigmas grow by
 _LEAST_VARIANCE = 1e-8  # m², rad²
 _LEAST_SCALE = 0.01  # of what wheels are off by, however well they are said to be known
+_IN_ITS_PLACE = ", which is given in its place"
 _PLAIN = 0.7  # median whitened residual of sightings that fit
 
 
@@ -246,21 +247,22 @@ class Sanity:
                 x, y = se2.compose(pose, (*place, 0.0))[:2] - self._landmarks[landmark_id]
                 yield math.hypot(x, y) / sigma
 
-    def judge(self, estimates: Sequence[Estimate], causal: bool = False) -> Verdict:
+    def judge(self, estimates: Sequence[Estimate], causal: bool = False, held: bool = False) -> Verdict:
         """Compare the run's trajectory with the simpler ones.
 
         Args:
             estimates: of the run, with increasing stamps.
             causal: the run's poses depend on nothing later: they are judged and not replaced.
+            held: likewise of a run that keeps the first pose which it was given against its sightings.
         """
         track = self._track(estimates[0].stamp_ns, estimates[-1].stamp_ns)
         if track is None:
             return Verdict(self.watch.findings())
         verdict = judged(track, estimates)
-        if not causal:
+        if not (causal or held):
             return verdict
-        findings = self.watch.findings() or verdict.findings
-        return replace(verdict, simpler=None, findings=findings)
+        told = [replace(f, text=f.text.replace(_IN_ITS_PLACE, "")) for f in verdict.findings]
+        return replace(verdict, simpler=None, findings=self.watch.findings() or tuple(told))
 
     def _track(self, first_ns: int, last_ns: int) -> Track | None:
         """Odometry and sightings between two times, the last pass of a clock that jumped; None: no motion known."""
@@ -429,7 +431,7 @@ def _simpler(track: Track, estimates: Sequence[Estimate], poses: FloatArray, by:
     if math.isfinite(by.residual):
         contradicted = float(np.clip(by.residual / _PLAIN, 1.0, _WORST))
     trajectory = _as_trajectory(track, poses, _dead_reckoned(track, estimates[0], contradicted))
-    text = f"The estimate explains the recording worse than odometry alone, which is given in its place: {why}."
+    text = f"The estimate explains the recording worse than odometry alone{_IN_ITS_PLACE}: {why}."
     return Verdict((Finding("sanity.odometry", text, Severity.ERROR),), _estimates(trajectory), trajectory)
 
 
@@ -471,8 +473,8 @@ def _textbook(track: Track, alone: FloatArray, laid: FloatArray, explained: floa
     worst = max(1.0, theirs.residual / _PLAIN)
     given = _as_trajectory(some, poses, covs * worst**2)
     text = (
-        "The estimate explains the recording worse than plain smoothing with fixed constants, which is given in its "
-        f"place: that explains {_percent(theirs.explained)} of the sightings, the estimate at most "
+        f"The estimate explains the recording worse than plain smoothing with fixed constants{_IN_ITS_PLACE}: that "
+        f"explains {_percent(theirs.explained)} of the sightings, the estimate at most "
         f"{_percent(explained)}."
     )
     return Verdict((Finding("sanity.textbook", text, Severity.ERROR),), _estimates(given, Mode.OK), None)

@@ -15,7 +15,8 @@ from fgloc.errors import EstimatorError
 from fgloc.files.outputs import write_tum
 from fgloc.recording.storage import find_beside
 from fgloc.runner import RunResult, run
-from fgloc.types import Mode, TruthEvent
+from fgloc.sensors.maps import write_map
+from fgloc.types import LandmarkMap, Mode, TruthEvent
 
 
 def errors(result: RunResult) -> np.ndarray:
@@ -102,6 +103,18 @@ def test_without_sightings_a_given_first_pose_is_enough(tmp_path):
     result = run(bag, tmp_path / "map.yaml", settings, "online")
     assert result.modes[-1] is Mode.DEAD_RECKONING
     assert errors(result).max() < 0.15
+
+
+def test_a_first_pose_that_holds_against_the_map_holds_in_batch_as_online(tmp_path):
+    truth = beacons()
+    world = World(truth, seconds=19.0)
+    bag = write_world(tmp_path, world)
+    shifted = {i: replace(m, position=m.position + np.array([1.0, 0.0, 0.0])) for i, m in truth.landmarks.items()}
+    write_map(LandmarkMap(shifted, None), tmp_path / "shifted.yaml")
+    settings = config(estimator={"initial_pose": tuple(world.truth(START_NS))})
+    for mode in ("online", "batch"):
+        result = run(bag, tmp_path / "shifted.yaml", settings, mode, check=False)
+        assert errors(result).max() < 0.4, mode
 
 
 def test_without_a_map_landmarks_are_estimated_and_returned(tmp_path):
