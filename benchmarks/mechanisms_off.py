@@ -207,7 +207,6 @@ _MODES = "fgloc.estimation.landmark_modes:LandmarkModes"
 _MOTION = "fgloc.estimation.motion"
 _FAULTS = "fgloc.estimation.faults"
 _BUDGET = "fgloc.graph.noise"
-_CONSENSUS = "fgloc.estimation.pose_fit:PoseConsensus"
 _WHERE = "fgloc.estimation.tracking:Tracking"
 
 
@@ -395,14 +394,6 @@ OF_TRACKING: tuple[Mechanism, ...] = (
         "start_trimming",
         "A place is fitted again to the sightings that it explains.",
         (Switch("fgloc.estimation.place:MOST_STEPS", Constant(0)),),
-        case="ids30",
-    ),
-    Mechanism(
-        "jump_compelling",
-        "A place other than the tracked one needs two landmarks, and nearly all sightings of an image or two images.",
-        (Switch(f"{_CONSENSUS}.overrides_prior", Returns(True)),),
-        Probe(f"{_CONSENSUS}.overrides_prior", lambda result, *_: not result),
-        batch=True,
         case="ids30",
     ),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -59,9 +59,7 @@ class PlaceSearch:
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
-        if not best.certain or (known and not best.overrides_prior()):
-            return None
-        return best
+        return best if best.certain else None
 
     def _agreed(self, fit: Fit, fitted: PoseFit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
         """Fit a place to the sightings that it explains, as long as they get more."""
@@ -92,8 +90,6 @@ class PlaceSearch:
             sum(residuals.values()) - se2.DOF,
             frozenset(seen - information_of.keys()),
             not any(m.of_landmark for m in agreeing),
-            _lasting(agreeing, self._window_ns),
-            sum(n > 1 for n in Counter(i for i, _ in {(m.landmark_id, m.stamp_ns) for m in agreeing}).values()),
         )
 
     def _candidates(self, sightings: Sequence[LandmarkMeasurement], known: bool) -> Iterator[FloatArray]:

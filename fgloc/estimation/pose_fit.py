@@ -159,9 +159,7 @@ class PoseConsensus:
     landmarks: int
     redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
     outlier_landmarks: frozenset[int]  # landmarks that it does not explain
-    by_sensors: bool = False  # from registered sensors alone ...
-    lasting: bool = False  # ... over as long as is collected
-    repeated: int = 0  # landmarks that agree in two images or more
+    by_sensors: bool = False  # from registered sensors alone
 
     @property
     def certain(self) -> bool:
@@ -178,16 +176,6 @@ class PoseConsensus:
     @property
     def _sigmas(self) -> FloatArray:
         return np.sqrt(np.diag(self.fit.cov))
-
-    def overrides_prior(self) -> bool:
-        """Whether it is evidence that the robot is elsewhere than estimated.
-
-        One landmark alone may have been moved, and two in one image may be misread so that they agree, unless nearly
-        everything else agrees with them.
-        """
-        sharp = bool((self._sigmas <= _SHARP_SIGMA).all())
-        whole = sharp and self.share >= WHOLE_SHARE and self.fit.redundancy >= 2 * REDUNDANT
-        return self.repeated > 1 or (whole and (self.landmarks > 1 or self.lasting))
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:
