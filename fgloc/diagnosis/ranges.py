@@ -37,6 +37,8 @@ _FLOOR_M = 0.03  # of a range's noise, with what wheels err by over a stretch
 _WORSE = 1.4  # times the misfit of the best turn from which on the one as configured is refuted ...
 _APART, _RIVAL = 0.3, 1.1  # ... and any other that is so far from the best
 _TURN_OFF, _WAY_OFF, _RANGE_OFF, _BIAS_OFF_M = 0.15, 0.1, 0.03, 0.05  # less are constants, which the graph estimates
+_SOUND_VALUES = np.array([1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0])  # turn, way, scale, offset; with the scale held
+_LEAST = np.array([_TURN_OFF, _WAY_OFF, _RANGE_OFF, math.inf, math.inf, math.inf, math.inf, _BIAS_OFF_M])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,14 +101,16 @@ def fit_ranges(
     best = min(tried, key=problem.misfit)
     rivals = [problem.misfit(x) for x in tried if abs(x.turn - best.turn) > _APART]
     unscaled = problem.solve(best, _HELD_SCALE)
-    left_out = []
-    for k in range(len(stretches)):
-        some = _Problem([*stretches[:k], *stretches[k + 1 :]], tag)
-        both = (some.solve(x.without(k), prior) for x, prior in ((best, _PRIOR), (unscaled, _HELD_SCALE)))
-        left_out.append([value for x in both for value in x.values])
-    sigma = jackknife(np.array(left_out))
-    found = [*best.values, *unscaled.values]
-    turn, way, scale, _, _, _, _, bias = (Figure(v, float(s)) for v, s in zip(found, sigma, strict=True))
+    found = np.array([*best.values, *unscaled.values])
+    sigma = np.zeros(len(found))
+    if (np.abs(found - _SOUND_VALUES) > _LEAST).any():  # else nothing can be named, however sure it is
+        left_out = []
+        for k in range(len(stretches)):
+            some = _Problem([*stretches[:k], *stretches[k + 1 :]], tag)
+            both = (some.solve(x.without(k), prior) for x, prior in ((best, _PRIOR), (unscaled, _HELD_SCALE)))
+            left_out.append([value for x in both for value in x.values])
+        sigma = jackknife(np.array(left_out))
+    turn, way, scale, _, _, _, _, bias = (Figure(float(v), float(s)) for v, s in zip(found, sigma, strict=True))
     return RangeFit(turn, way, scale, bias, problem.misfit(best), as_given, min(rivals, default=math.inf))
 
 
