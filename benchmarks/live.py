@@ -435,7 +435,8 @@ def truth_of(recorded: Recorded) -> Callable[[int], FloatArray]:
 
 def roles_of(events: Iterable[Event]) -> set[Role]:
     """Roles that the events play."""
-    return {role for role in map(role_of, events) if role is not None}
+    topics = Config().recording.topics
+    return {role for event in events if (role := role_of(event, topics)) is not None}
 
 
 def feed(live: Live, events: Iterable[Event]) -> None:
