@@ -60,7 +60,7 @@ def factors(bag, with_map: bool):
     return written["x_per_sqrt_m"] / default.x_per_sqrt_m, written["yaw_per_sqrt_rad"] / default.yaw_per_sqrt_rad
 
 
-@pytest.mark.parametrize("with_map", [True, False])
+@pytest.mark.parametrize("with_map", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize("made", [(1.0, 1.0), (3.0, 2.0)])
 def test_the_noise_is_found(tmp_path, made, with_map):
     found = factors(record(tmp_path, *made), with_map)

@@ -234,7 +234,7 @@ _COUNTS = {1: (61785, 1534, 407, 1), 2: (65005, 3239, 792, 0), 3: (61158, 4348, 
 
 
 @pytest.mark.real_data
-@pytest.mark.parametrize("robot", [1, 4])
+@pytest.mark.parametrize("robot", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_real_files_lose_nothing(robot: int, tmp_path: Path) -> None:
     source = real_data("mrclam6")
     run = read(source, robot)

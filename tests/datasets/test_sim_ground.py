@@ -23,7 +23,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_ramp(tmp_path_factory.mktemp("ramp"))
 
 
-@pytest.mark.parametrize(("mode", "kind"), [("online", "fixed_lag"), ("batch", "fixed_lag"), ("online", "ekf")])
+@pytest.mark.parametrize(
+    ("mode", "kind"),
+    [("online", "fixed_lag"), pytest.param("batch", "fixed_lag", marks=pytest.mark.slow), ("online", "ekf")],
+)
 def test_the_robot_is_found_in_space(folder: Path, mode: str, kind: str, tmp_path: Path) -> None:
     result, config = estimated(folder, mode, kind=kind)
     matched = match_result(result, config)

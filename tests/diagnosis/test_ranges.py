@@ -51,7 +51,11 @@ def first(bag):
 
 @pytest.mark.parametrize(
     ("wrong", "code", "factor"),
-    [({"turn": -1.0}, "wheels.sign", -1.0), ({"turn": -2.0}, "wheels.sign", -0.5), ({"turn": 0.5}, "wheels.turn", 2.0)],
+    [
+        ({"turn": -1.0}, "wheels.sign", -1.0),
+        pytest.param({"turn": -2.0}, "wheels.sign", -0.5, marks=pytest.mark.slow),
+        ({"turn": 0.5}, "wheels.turn", 2.0),
+    ],
 )
 def test_wheels_that_turn_otherwise_than_ranges_show_are_named_and_corrected(tmp_path, wrong, code, factor):
     codes, config = first(write(tmp_path, **wrong))

@@ -133,7 +133,7 @@ def half_the_size(landmark):
         (all_in_feet, "map.unit", 0.3048),
         pytest.param(in_centimetres, "map.unit", 0.01, marks=pytest.mark.slow),
         pytest.param(w_first, "map.quaternions", None, marks=pytest.mark.slow),
-        (shifted, "map.ids", 1.0),
+        pytest.param(shifted, "map.ids", 1.0, marks=pytest.mark.slow),
         pytest.param(half_the_size, "map.size", 2.0, marks=pytest.mark.slow),
     ],
 )

@@ -201,7 +201,7 @@ def mecanum(tmp_path_factory):
     return folder, write_mecanum(folder)
 
 
-@pytest.mark.parametrize("mode", ["batch", "online"])
+@pytest.mark.parametrize("mode", ["batch", pytest.param("online", marks=pytest.mark.slow)])
 def test_a_run_finds_the_geometry_of_a_mecanum_drive(mecanum, mode):
     folder, config = mecanum
     result = run_recording(folder / "bag", folder / "map.yaml", config, mode)

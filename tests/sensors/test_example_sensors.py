@@ -314,7 +314,7 @@ def test_the_pose_is_found_and_held_by_one_sensor_alone(recording, sensor, bound
         assert result.rejections["gnss.gate"] > 0
 
 
-@pytest.mark.parametrize("kind", ["fixed_lag", "ekf"])
+@pytest.mark.parametrize("kind", ["fixed_lag", pytest.param("ekf", marks=pytest.mark.slow)])
 def test_online_every_estimator_takes_both(recording, kind):
     config = load_config(recording / "robot.yaml")
     config = config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": kind})})
