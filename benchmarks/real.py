@@ -16,6 +16,8 @@ import numpy as np
 from benchmarks import stills
 from benchmarks.common import DATA, MODELS, SAMPLES, Row, main, not_run
 from fgloc import se2
+from fgloc.calibration.first_settings import first_settings
+from fgloc.calibration.installation import with_settings
 from fgloc.config import Config, config_of, load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.reader import open_recording
@@ -25,7 +27,7 @@ from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.measurements import PointMeasurement
 from fgloc.sensors.range_bearing import RangeBearingEvent
-from fgloc_datasets import mrclam, pioneer, turtlebot3
+from fgloc_datasets import mrclam
 
 _SAMPLE = SAMPLES / "first_run"
 _MRCLAM_UNITS = {
@@ -72,34 +74,27 @@ def _mrclam(folder: Path, robots: Iterable[int]) -> Iterator[Row]:
 
 
 def _pioneer(folder: Path, names: Iterable[str]) -> Iterator[Row]:
-    """Rows of fgloc and of wheel odometry, both against the mocap target.
+    """Rows of fgloc and of wheel odometry on the bags themselves, with what `fgloc init` writes.
 
-    Plain: the recording as it is, mocap at its time of receipt and the target taken for the robot's base, as the
-    figures to beat were measured. Seated: mocap bursts dated back and the target where it sits on the robot (found
-    without our estimate), which is what the two trajectories are really off by.
+    Evaluation places the tracked body on the robot for both, so that both are judged alike.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        for name in names:
-            converted = pioneer.convert(folder / f"{name}.bag", Path(scratch) / name)
-            seated = _configured(converted, {})
-            offsets = {role: s for role, s in seated.recording.stamp_offset_s.items() if role != "truth"}
-            as_recorded = {"truth": {"offset_m": (0.0, 0.0)}, "recording": {"stamp_offset_s": offsets}}
-            plain = _configured(converted, as_recorded)
-            blind = {"recording": {"topics": {"sightings": "none"}}}
-            for label, bag, config in (("", folder / f"{name}.bag", plain), (".seated", converted, seated)):
-                ours = compute_metrics(run(bag, None, config, "batch"), config)
-                odometry = _configured(converted, blind, config)
-                wheels = compute_metrics(run(bag, None, odometry, "online"), odometry)
-                yield Row(f"pioneer.{name}{label}.ate_rmse_m", ours.ate_rmse_m, unit="m")
-                yield Row(f"pioneer.{name}{label}.odometry.ate_rmse_m", wheels.ate_rmse_m, unit="m")
+    for name in names:
+        bag = folder / f"{name}.bag"
+        config = _initial(bag)
+        ours = compute_metrics(run(bag, None, config, "batch"), config)
+        blind = _configured(bag, {"recording": {"topics": {"sightings": "none"}}}, config)
+        wheels = compute_metrics(run(bag, None, blind, "online"), blind)
+        yield Row(f"pioneer.{name}.ate_rmse_m", ours.ate_rmse_m, unit="m")
+        yield Row(f"pioneer.{name}.odometry.ate_rmse_m", wheels.ate_rmse_m, unit="m")
 
 
 def _turtlebot3(folder: Path) -> Iterator[Row]:
-    with tempfile.TemporaryDirectory() as scratch:
-        bag = turtlebot3.convert(folder / "rosbag2_2025_11_25-15_11_34", Path(scratch))
-        config, map_path = _configured(bag, {}), find_beside(bag, "map.yaml")
-        result = run(bag, map_path, config, "batch")
-        medians = _residual_medians(bag, config, map_path, result)
+    """Rows of a bag of others with its own map, with what `fgloc init` writes and what the run itself finds."""
+    bag, map_path = folder / "rosbag2_2025_11_25-15_11_34", folder / "landmarks_2025_real.yaml"
+    config = _initial(bag)
+    result = run(bag, map_path, config, "batch")
+    assert result.found is not None
+    medians = _residual_medians(bag, with_settings(config, result.found.settings), map_path, result)
     yield Row(
         "turtlebot3.residual_median_m", max(medians.values()), float(np.std(list(medians.values()))), len(medians), "m"
     )
@@ -109,10 +104,16 @@ def _turtlebot3(folder: Path) -> Iterator[Row]:
     yield Row("turtlebot3.accepted_spikes", wrong, n=len(poses))
 
 
-def _residual_medians(bag: Path, config: Config, map_path: Path | None, result: RunResult) -> dict[int, float]:
+def _initial(bag: Path) -> Config:
+    """Settings that `fgloc init` writes for a bag."""
+    with tempfile.TemporaryDirectory() as scratch:
+        robot = Path(scratch) / "robot.yaml"
+        robot.write_text(first_settings(bag).text)
+        return load_config(robot)
+
+
+def _residual_medians(bag: Path, config: Config, map_path: Path, result: RunResult) -> dict[int, float]:
     """Median distance [m] between where each landmark is and where the smoothed robot's sightings put it."""
-    if map_path is None:
-        raise FileNotFoundError("the converter wrote no map.yaml")
     landmark_map = load_map(map_path)
     x, y, z, _, _, yaw = config.recording.sightings_pose or (0.0,) * 6
     T_base_sensor = np.eye(4)

@@ -15,7 +15,7 @@ from fgloc.files.atomic import check_out
 # --- convert: public sets as bags -------------------------------------------------------------------------------------
 
 convert_app = group(
-    "Convert public data sets to bags. Each gets a robot.yaml and, where landmarks were surveyed, a map.yaml."
+    "Convert public data sets that are no bags. Each gets a robot.yaml and, where landmarks were surveyed, a map.yaml."
 )
 
 Storage = Annotated[str, typer.Option("--storage", help="mcap or sqlite3")]
@@ -61,62 +61,6 @@ def mrclam(
             f"{run.unknown_left_out} of no known barcode"
         )
     _say_next(folder)
-
-
-@convert_app.command()
-def pioneer(
-    source: Annotated[Path | None, typer.Argument(metavar="BAG", help="duarte.bag or pinto1.bag")] = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for bag/ and robot.yaml")] = Path("pioneer"),
-    storage: Storage = "mcap",
-    download: Download = None,
-    name: Annotated[str, typer.Option(help="which one to download: duarte or pinto1")] = "duarte",
-) -> None:
-    """A Pioneer with ArUco markers. Truth by motion capture."""
-    from fgloc_datasets.convert import fetch
-    from fgloc_datasets.pioneer import REMOTES
-    from fgloc_datasets.pioneer import convert as converted
-
-    check_out(out)
-    if download is not None:
-        if name not in REMOTES:
-            raise typer.BadParameter(f"{name!r} is not one of {', '.join(REMOTES)}", param_hint="--name")
-        source = fetch(REMOTES[name], download)
-    if source is None:
-        raise typer.BadParameter("give the bag, or --download FOLDER", param_hint="BAG")
-    converted(source, out, storage)
-    _say_written(out)
-
-
-@convert_app.command()
-def turtlebot3(
-    source: Annotated[Path | None, typer.Argument(metavar="BAG", help="rosbag2 folder")] = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="folder for bag/, map.yaml and robot.yaml")] = Path(
-        "turtlebot3"
-    ),
-    landmarks: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="list of landmarks, if it is not beside the bag")
-    ] = None,
-    storage: Storage = "mcap",
-    download: Download = None,
-    url: Url = None,
-) -> None:
-    """A TurtleBot3 Burger with AprilTags."""
-    from fgloc_datasets.convert import unpack
-    from fgloc_datasets.turtlebot3 import convert_and_tell
-
-    check_out(out)
-    unknown = "the set has no public address that we know; give one with --url"
-    source = _given_or_fetched(source, "BAG", download, url, unknown)
-    if download is not None and source.suffix == ".zip":
-        source = unpack(source, source.with_suffix(""))
-        found = sorted(source.rglob("metadata.yaml"))
-        source = found[0].parent if found else source
-    _, dropped, notes = convert_and_tell(source, out, storage, landmarks)
-    for what, count in dropped.items():
-        say(f"left out: {count} messages of {what}: the definition of their type is not known")
-    for note in notes:
-        say(f"note: {note}")
-    _say_written(out)
 
 
 @convert_app.command()
