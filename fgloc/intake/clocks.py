@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -171,6 +172,7 @@ _ALIVE_NS = 2_000_000_000  # a topic without messages for longer is no reference
 _PATIENCE_NS = 3_000_000_000  # for how long messages are held back
 _SHARE = 0.1  # of a new delay in the mean
 _MOST_HELD = 5000  # messages of a source: 3 s of a fast sensor
+_MOST_NAMES = 1000  # characters of a publisher's names that are kept
 _MOST_SOURCES = 1000  # whose clocks are followed: joints may come under ever new names
 _STAMPED = (MotionEvent, RawEvent, SightingsEvent)
 
@@ -179,8 +181,11 @@ Source = tuple[str, tuple[str, ...]]
 
 
 def source_of(event: Event) -> Source:
-    """The publisher of an event: of those that share a topic, which one."""
-    return event.topic, event.publisher if isinstance(event, MotionEvent) else ()
+    """The publisher of an event: of those that share a topic, which one. Long lists of names are a digest."""
+    publisher = event.publisher if isinstance(event, MotionEvent) else ()
+    if sum(map(len, publisher)) > _MOST_NAMES:
+        publisher = (hashlib.sha256("\0".join(publisher).encode(errors="surrogatepass")).hexdigest(),)
+    return event.topic, publisher
 
 
 @dataclass(slots=True)

@@ -1,5 +1,6 @@
 """A clock that is reset alone is corrected; jumps of all, strays and bursts pass as they are."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -127,3 +128,16 @@ def test_a_reset_sensor_of_sightings_is_put_back_too():
     _, out, _ = passed(sorted(events, key=lambda e: e.received_ns))
     delays = [e.received_ns - e.stamp_ns for e in out if e.topic == "/tags"]
     assert max(abs(d - 0.05e9) for d in delays) < 1e6
+
+
+def test_long_names_of_joints_are_not_kept():
+    clocks = TopicClocks()
+    tracemalloc.start()
+    try:
+        for k in range(50):
+            event = joints(0.1 * k, 0.0, 0.0)
+            clocks.correct(at(replace(event, names=(f"{k}" + "x" * 200_000, "right")), 0.1 * k + 0.003))
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < 1_000_000
