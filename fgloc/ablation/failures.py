@@ -1,4 +1,7 @@
-"""Failures of sensors, as filters of events that know nothing of the estimator."""
+"""Failures of messages, clocks, landmarks and several sensors, as filters of events that know nothing of the estimator.
+
+Those of one sensor are in its module: `fgloc.sensors.gyro.ImuBias`, for example.
+"""
 
 from __future__ import annotations
 

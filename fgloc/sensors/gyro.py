@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,9 +39,6 @@ from fgloc.sensors.failures import Carriage, Change, EventFailure, Scene
 from fgloc.sensors.wheels.motion import Standing
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import Event, FloatArray, InertialEvent, InertialReading, Setting, Step
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True, eq=False)

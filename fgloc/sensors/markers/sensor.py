@@ -273,7 +273,7 @@ _MIRRORED_SIGMA = 1.0  # rad, of the yaw of one that is not
 
 
 class CornerMeasurer:
-    """Corners of markers; see `fgloc.sensors.landmarks.LandmarkSensor` for what it rejects."""
+    """Corners of markers; see `fgloc.sensors.equipment.LandmarkSensor` for what it rejects."""
 
     def __init__(self, context: SightingContext) -> None:
         self._context = context
