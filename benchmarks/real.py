@@ -12,13 +12,14 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from benchmarks import stills
 from benchmarks.common import DATA, MODELS, SAMPLES, Row, main, not_run
 from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
 from fgloc.calibration.installation import with_settings
-from fgloc.config import Config, config_of, load_config
+from fgloc.config import Config, config_of, config_of_file, load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
@@ -106,10 +107,7 @@ def _turtlebot3(folder: Path) -> Iterator[Row]:
 
 def _initial(bag: Path) -> Config:
     """Settings that `fgloc init` writes for a bag."""
-    with tempfile.TemporaryDirectory() as scratch:
-        robot = Path(scratch) / "robot.yaml"
-        robot.write_text(first_settings(bag).text)
-        return load_config(robot)
+    return config_of_file(yaml.safe_load(first_settings(bag).text))
 
 
 def _residual_medians(bag: Path, config: Config, map_path: Path, result: RunResult) -> dict[int, float]:

@@ -74,33 +74,20 @@ def drive(
     url: Url = None,
 ) -> None:
     """DRIVE: a skid-steered Husky. Windows of 2 s; truth by ICP."""
+    from fgloc_datasets.convert import Remote, fetch
     from fgloc_datasets.drive import convert as converted
     from fgloc_datasets.drive import span
 
     check_out(out)
-    unknown = "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
-    source = _given_or_fetched(source, "CSV", download, url, unknown)
-    converted(source, out, storage, span(windows, "--windows"), span(calibration, "--calibration"))
-    _say_written(out)
-
-
-def _given_or_fetched(source: Path | None, name: str, download: Path | None, url: str | None, unknown: str) -> Path:
-    """The recording that was given as the argument ``name``, or downloaded; ``unknown``: why it needs an address."""
-    from fgloc_datasets.convert import Remote, fetch
-
     if download is not None:
         if url is None:
-            raise typer.BadParameter(unknown, param_hint="--download")
-        return fetch(Remote(url), download)
+            told = "the owner publishes a pickle, which is not opened; give a CSV's address with --url"
+            raise typer.BadParameter(told, param_hint="--download")
+        source = fetch(Remote(url), download)
     if source is None:
-        raise typer.BadParameter("give the recording, or --download FOLDER --url ADDRESS", param_hint=name)
-    return source
-
-
-def _say_written(out: Path) -> None:
-    """The files of one converted recording, and what to do with them."""
-    names = [name for name in ("bag", "map.yaml", "robot.yaml", "windows.csv") if (out / name).exists()]
-    say(f"written to {out}: {', '.join(names)}")
+        raise typer.BadParameter("give the file, or --download FOLDER --url ADDRESS", param_hint="CSV")
+    converted(source, out, storage, span(windows, "--windows"), span(calibration, "--calibration"))
+    say(f"written to {out}: bag, robot.yaml, windows.csv")
     _say_next(out)
 
 

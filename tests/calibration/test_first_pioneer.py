@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.rosbag1 import Writer
 
 from fgloc.calibration.first_settings import RobotFile, first_settings
-from fgloc.config import Config, load_config
+from fgloc.config import Config, config_of_file
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
@@ -112,10 +113,8 @@ def found(source: Path) -> RobotFile:
 
 
 @pytest.fixture(scope="module")
-def config(found: RobotFile, tmp_path_factory: pytest.TempPathFactory) -> Config:
-    path = tmp_path_factory.mktemp("settings") / "robot.yaml"
-    path.write_text(found.text)
-    return load_config(path)
+def config(found: RobotFile) -> Config:
+    return config_of_file(yaml.safe_load(found.text))
 
 
 def test_init_finds_axes_mounting_scale_and_what_the_truth_tracks(found: RobotFile, config: Config) -> None:
@@ -123,8 +122,8 @@ def test_init_finds_axes_mounting_scale_and_what_the_truth_tracks(found: RobotFi
     assert {"sightings.axes", "sightings.scale", "clock.truth", "truth.mounting"} <= codes
     assert config.recording.sightings_axes == "optical"
     assert config.recording.sightings_pose is not None
-    *_, yaw = config.recording.sightings_pose
-    assert yaw == pytest.approx(_CAMERA[2], abs=0.01)
+    _, y, *_, yaw = config.recording.sightings_pose  # the way ahead (0.05 m) is left at 0
+    assert (y, yaw) == pytest.approx(_CAMERA[1:], abs=0.01)
     assert config.landmarks.range_scale == pytest.approx(_SCALE, abs=0.01)
     assert "sightings" not in config.recording.stamp_offset_s
     assert config.recording.stamp_offset_s["truth"] == pytest.approx(_TRUTH_LATE_S, abs=0.01)
