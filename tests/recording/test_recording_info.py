@@ -193,6 +193,17 @@ def test_truth_in_bursts_and_blackouts_are_reported(tmp_path):
     assert "once, the longest 10.0 s from 10.0 s on" in one(info, "/seen")
 
 
+def test_two_receivers_of_a_sensor_are_a_choice_not_unread(tmp_path):
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(100):
+            bag.odometry("/odom", START_NS + k * TICK_NS, (0.05 * k, 0, 0), (1, 0), covs=(np.eye(6), None))
+            for place in ("front", "rear"):
+                bag.satellite_fix(f"/{place}", START_NS + k * TICK_NS, (48.0, 11.0, 500.0), (1.0, 1.0, 4.0))
+    info = inspect(tmp_path / "run", CONFIG)
+    assert not [line for line in info.findings if "/front" in line and "not used" in line]
+    assert [note for note in info.notes if "recording.topics.gnss" in note and "/rear" in note]
+
+
 def test_ambiguity_and_damage_do_not_stop_the_report(tmp_path):
     folder = write_drive(tmp_path / "run", n=50)
     config = Config.model_validate({"recording": {"topics": {"odometry": "/odm"}}})
