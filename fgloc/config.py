@@ -182,11 +182,9 @@ class NamedCameraConfig(CameraConfig):
     camera_info: str | None = Field(None, description="topic of its calibration; None: beside its images")
     sightings: str | None = Field(None, description="topic of markers that another node found in them")
     pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
-        None, description="in the base frame: x y z [m] roll pitch yaw [rad]; None: tf"
+        None, description="in the base frame, x forward: x y z [m] roll pitch yaw [rad]; None: tf"
     )
-    axes: Literal["body", "optical"] | None = Field(
-        None, description="axes of pose: optical (z forward; None too) or body (x forward)"
-    )
+    axes: Literal["body", "optical"] | None = Field(None, description="as recording.sightings_axes; None: optical")
 
     @model_validator(mode="after")
     def _has_a_topic(self) -> NamedCameraConfig:
@@ -463,11 +461,11 @@ class RecordingConfig(Section):
     )
     base_frame: str | None = Field(None, description="None: base_link, base_footprint or base")
     sightings_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
-        None, description="sensor in the base frame: x y z [m] roll pitch yaw [rad]; None: tf"
+        None, description="sensor in the base frame, x forward: x y z [m] roll pitch yaw [rad]; None: tf"
     )
     sightings_axes: Literal["body", "optical"] | None = Field(
         None,
-        description="of sightings_pose and marker poses: body, or optical (None: for cameras)",
+        description="of what it measures: body (x forward) or optical (z forward; None: of cameras)",
     )
     imu_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
         None, description="IMU, likewise; None: tf"
