@@ -63,12 +63,14 @@ class WheelsConfig(Section):
         description="twist or pose of the odometry; ticks of the joints; commands; auto: ticks if the geometry is "
         "given, else pose if it moves along its heading, else twist, else command",
     )
-    left_joint: str | None = Field(None, description="joint of the left wheel")
-    right_joint: str | None = Field(None, description="of the right wheel")
+    left_joint: str | None = Field(None, description="joint of the wheel on this side")
+    right_joint: str | None = Field(None, description="joint of the wheel on this side")
     left_radius: float | None = Field(
         None, ge=1e-6, le=2.0, description="m: way per unit of the angle, usually a radian"
     )
-    right_radius: float | None = Field(None, ge=1e-6, le=2.0, description="m: likewise")
+    right_radius: float | None = Field(
+        None, ge=1e-6, le=2.0, description="m: way per unit of the angle, usually a radian"
+    )
     track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the contact points")
     angle_range: float | None = expert(
         None, ge=1e-3, le=1e9, description="rad after which the angle rolls over; None: never"
@@ -87,17 +89,15 @@ class WheelsConfig(Section):
         0.01,
         ge=0,
         le=0.5,
-        description="sigma of a scale that both radii share; estimated",
+        description="sigma of a scale that both radii share",
     )
-    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="sigma of the track; estimated")
-    time_offset_sigma_s: float = expert(
-        0.005, ge=0, le=1.0, description="s: sigma of their clock against the gyro's; estimated"
-    )
+    turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="sigma of the track")
+    time_offset_sigma_s: float = expert(0.005, ge=0, le=1.0, description="s: sigma of their clock against the gyro's")
     yaw_per_m_sigma: float = expert(
         0.015,
         ge=0,
         le=1,
-        description="rad/m: sigma of yaw_per_m; estimated",
+        description="rad/m: sigma of yaw_per_m",
     )
     slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: sigma of slowdown")
     delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: sigma of delay_s")
@@ -114,7 +114,7 @@ class GyroConfig(Section):
     use: bool = expert(True, description="false: the gyro is not read")
     scale: float = expert(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: clockwise")
     yaw_per_sqrt_s: float = expert(0.002, ge=1e-6, le=10, description="rad/√s: noise of the integrated rate")
-    scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of scale; estimated")
+    scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of scale")
     bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="rad/s: sigma of the bias at the start")
     tilt_sigma_rad: float = constant(
         0.0087,
@@ -150,12 +150,10 @@ class CameraConfig(Section):
     rescale: bool = expert(False, description="scale the calibration to the image size")
     focal_scale: float = expert(1.0, ge=0.01, le=100, description="true focal length over the calibration's")
     cx_px: float | None = expert(None, ge=-1e5, le=1e5, description="px: principal point; None: the calibration's")
-    cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="px, likewise")
+    cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="px: principal point; None: the calibration's")
     k1: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; None: the calibration's")
     k2: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; None: the calibration's")
-    position_sigma_m: float = expert(
-        0.003, ge=0, le=1.0, description="m: sigma of the mounting, on each axis; estimated"
-    )
+    position_sigma_m: float = expert(0.003, ge=0, le=1.0, description="m: sigma of the mounting, on each axis")
     rotation_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="rad: likewise, about each axis")
     focal_sigma: float = expert(0.003, ge=0, le=0.5, description="sigma of the focal length, as a share")
     principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="px: sigma of the principal point")
@@ -164,7 +162,7 @@ class CameraConfig(Section):
         0.012,
         ge=0,
         le=1.0,
-        description="s: sigma of its clock against the gyro's (else the wheels'); estimated",
+        description="s: sigma of its clock against the gyro's (else the wheels')",
     )
     time_jitter_s: float = constant(
         0.002,
@@ -203,13 +201,11 @@ class LandmarksConfig(Section):
     range_along_axis: bool = expert(False, description="the reported range is a depth along the sensor's axis")
     range_bias_m: float = expert(0.0, ge=-100, le=100, description="subtracted from the reported range")
     bearing_bias_rad: float = expert(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
-    range_scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of range_scale; estimated")
-    bearing_bias_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="sigma of bearing_bias_rad; estimated")
-    position_sigma_m: float = expert(
-        0.0, ge=0, le=1.0, description="m: sigma of the mounting, ahead and to the left; estimated"
-    )
+    range_scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of range_scale")
+    bearing_bias_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="sigma of bearing_bias_rad")
+    position_sigma_m: float = expert(0.0, ge=0, le=1.0, description="m: sigma of the mounting, ahead and to the left")
     time_offset_sigma_s: float = expert(
-        0.012, ge=0, le=1.0, description="s: sigma of the sensor's clock against gyro or wheels; estimated"
+        0.012, ge=0, le=1.0, description="s: sigma of the sensor's clock against gyro or wheels"
     )
     yaw_sigma_rad: float | None = expert(
         None,
@@ -297,7 +293,7 @@ class MotionConfig(Section):
     )
     use: bool = expert(True, description="false: the model is not used")
     scale: float = expert(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
-    scale_sigma: float = expert(0.01, ge=0, le=0.5, description="sigma of scale; estimated")
+    scale_sigma: float = expert(0.01, ge=0, le=0.5, description="sigma of scale")
     correlation: Literal["joint", "independent"] = expert(
         "joint", description="joint: decorrelated from the wheels; independent: for comparison"
     )
@@ -558,7 +554,7 @@ class MapConfig(Section):
 
     scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres per unit of positions")
     size_scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres per unit of the map's marker sizes")
-    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m: sigma of a landmark, on each axis; estimated")
+    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m: sigma of a landmark, on each axis")
     rotation_sigma_rad: float = expert(0.0087, ge=0, le=1.0, description="rad: sigma of a marker, about each axis")
 
 

@@ -3,6 +3,7 @@
 `python tests/config_rows.py` rewrites them, and with them the JSON schemas of docs/schema/.
 """
 
+import itertools
 import typing
 from pathlib import Path
 
@@ -37,16 +38,21 @@ def sections(model=PAGES["configuration.md"], path=""):
 def rows(section):
     """One line of a Markdown table per value of a section, or of one of several kinds.
 
-    Keys of a parent class that has a table of its own stand there alone.
+    Neighbouring keys with the same default and meaning share a line. Keys of a parent class that has a table of its own
+    stand there alone.
     """
     if isinstance(section, tuple):
         yield from _rows_of_kinds(section)
         return
     parents = [base.model_fields.items() for base in section.__mro__[1:] if base in _OWN_TABLE]
     elsewhere = {key for fields in parents for key, field in fields if level_of(field) != "constant"}
-    for name, field in section.model_fields.items():
-        if _section(field) is None and name not in elsewhere:
-            yield f"| `{name}` | {_default(field.default)} | {_meaning(field)} |"
+    told = [
+        (name, (_default(field.default), _meaning(field)))
+        for name, field in section.model_fields.items()
+        if _section(field) is None and name not in elsewhere
+    ]
+    for (default, meaning), alike in itertools.groupby(told, key=lambda row: row[1]):
+        yield f"| {', '.join(f'`{name}`' for name, _ in alike)} | {default} | {meaning} |"
 
 
 def _rows_of_kinds(kinds):
@@ -92,13 +98,14 @@ def _default(value):
 
 def tables(model=PAGES["configuration.md"]):
     """All tables, as they stand in the document; first that of the values outside every section."""
-    parts = []
+    parts, said = [], set()
     for name, section in (("top level", model), *sections(model)):
         if lines := list(rows(section)):
             about, columns = _OF_KINDS, "| key | kinds | default | meaning |\n|---|---|---|---|"
             if not isinstance(section, tuple):
                 about, columns = section.__doc__.strip().splitlines()[0], "| key | default | meaning |\n|---|---|---|"
-            head = f"### {name}\n\n{about}\n\n{columns}"
+            head = f"### {name}\n\n{columns}" if about in said else f"### {name}\n\n{about}\n\n{columns}"
+            said.add(about)  # the values of experts are of the same section
             parts.append("\n".join([head, *lines]) + "\n")
     return "\n".join(parts)
 
