@@ -243,6 +243,13 @@ class MarkersConfig(Section):
         le=0.1,
         description="s: a corner is off by the image's motion in this time",
     )
+    sway_rad: float = constant(
+        0.005,
+        "between 0.0005 and 0.015 nothing changes",
+        ge=0,
+        le=0.5,
+        description="rad: sigma of a base's roll and pitch in each image, on a flat floor",
+    )
     cauchy_k: float = constant(
         3.0,
         "as for ranges",

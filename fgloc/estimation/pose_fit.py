@@ -108,7 +108,7 @@ class PoseFit:
         if len(self._cov):
             P = self._cov[stack.columns[:, :, None], stack.columns[:, None, :]]
             cov = cov + stack.H @ P @ stack.H.transpose(0, 2, 1)
-        shared = [batch.shared(i, stack.J[i], stack.H[i]) for i in range(n)]
+        shared = [batch.shared(i, stack) for i in range(n)]
         cov = cov + np.array([g @ g.T for g in shared])
         useless = stack.behind | ~(np.trace(cov, axis1=1, axis2=2) < _TELLS_NOTHING)
         noise = np.where(stack.behind, 1.0, _TELLS_NOTHING)

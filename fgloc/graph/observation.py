@@ -35,8 +35,9 @@ class Linearized:
         J: ``(d, 3)`` by the right perturbation of the pose.
         columns: ``(c,)`` parameters of the installation that it depends on.
         H: ``(d, c)`` by these.
-        shared: ``(d, s)`` square root of the covariance that comes on top of the identity: of the stamp's jitter and
-            of the motion by which the sighting was moved to its keyframe; the same for all of one image.
+        shared: ``(d, s)`` square root of the covariance that comes on top of the identity: of the stamp's jitter, of
+            the base's roll and pitch, and of the motion by which the sighting was moved to its keyframe; the same for
+            all of one image.
         behind: whether a corner is behind the camera; the residual then means nothing.
     """
 
@@ -62,6 +63,7 @@ class Stacked:
         H: ``(m, d, c)`` by the parameters in `columns` ``(m, c)``; -1: none, then H is 0.
         columns: see above.
         behind: ``(m,)`` whether a corner is behind the camera.
+        by_tilt: ``(m, d, 2)`` by roll and pitch of the base; None: they are states, or nothing depends on them.
     """
 
     residual: FloatArray
@@ -69,6 +71,7 @@ class Stacked:
     H: FloatArray
     columns: IntArray
     behind: NDArray[np.bool_]
+    by_tilt: FloatArray | None = None
 
 
 class Batch(Protocol):
@@ -90,7 +93,7 @@ class Batch(Protocol):
         """`Linearized.shared` of all ``(m, d, s)``, with columns of 0 where one has fewer; None: only one by one."""
         ...
 
-    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+    def shared(self, i: int, stack: Stacked) -> FloatArray:
         """Return `Linearized.shared` of sighting ``i``."""
         ...
 
@@ -152,6 +155,7 @@ class CornerBatch:
         self._tilting = np.array([(*m.tilting, 0.0) for m in seen]) if installation.ground else None
         self._offset = np.array([m.offset_s for m in seen])
         self._jitter = np.array([m.jitter_s for m in seen])
+        self._sway = np.array([m.sway_rad for m in seen])
         self._moved = _roots([m.motion_cov for m in seen])
         self._outward, self._small = _shrinking(self._pixels)
         self._blur_px = np.array([m.blur_s for m in seen]) * self._speed(2.0 * half)
@@ -222,9 +226,13 @@ class CornerBatch:
         H[..., 3:6] = _crossed(A, mounted)  # -A (φ x X) by φ
         H[..., 6:11] = by_lens
         H[..., 11] = by_time
+        by_tilt = None  # as the camera turns in its place: its way about the base is less than a millimetre
+        if self._tilting is None:
+            about = (H[..., 3:6] @ self._R.transpose(0, 2, 1)[:, None])[..., :2]
+            by_tilt = (about * scale[:, None, None, None]).reshape(n, 8, 2)
         self._by_marker(H, B @ Rz.transpose(0, 2, 1)[:, None], local)
         H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
-        return Stacked(residual, J, H, self._columns, behind)
+        return Stacked(residual, J, H, self._columns, behind, by_tilt)
 
     def _flow(self, q: FloatArray) -> FloatArray:
         """How points ``(m, 4, 3)`` in the base frame move by a later stamp [m/s]."""
@@ -310,18 +318,22 @@ class CornerBatch:
         shrunk = self._outward * (self._small * self._blur_px / self._noise_px)[:, None]
         jitter = self._jitter[:, None] * stack.H[:, :, 11]
         common = np.stack([shrunk, jitter], axis=2)
+        if stack.by_tilt is not None:
+            common = np.concatenate([common, self._sway[:, None, None] * stack.by_tilt], axis=2)
         if all(moved is None for moved in self._moved):
             return common
         roots = np.array([np.zeros((3, 3)) if moved is None else moved for moved in self._moved])
         return np.concatenate([common, stack.J[:, :, :3] @ roots], axis=2)
 
-    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+    def shared(self, i: int, stack: Stacked) -> FloatArray:
         """Square root ``(8, s)`` of the covariance that sighting ``i`` shares with its image, see `Linearized`."""
         shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
-        common = [shrunk, self._jitter[i] * H[:, 11:12]]
+        common = [shrunk, self._jitter[i] * stack.H[i, :, 11:12]]
+        if stack.by_tilt is not None:
+            common.append(self._sway[i] * stack.by_tilt[i])
         moved = self._moved[i]
         if moved is not None:
-            common.append(J @ moved)
+            common.append(stack.J[i, :, :3] @ moved)
         return np.hstack(common)
 
 
@@ -471,9 +483,9 @@ class PlanarBatch:
         """`shared` of all sightings ``(m, 3, 0)``."""
         return np.zeros((*stack.residual.shape, 0))
 
-    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+    def shared(self, i: int, stack: Stacked) -> FloatArray:
         """Matrix ``(d, 0)``: the noise of these sightings has no shared part, see `Linearized`."""
-        return np.zeros((len(J), 0))
+        return np.zeros((self.rows[i], 0))
 
 
 # --- Measurements of registered sensors -------------------------------------------------------------------------------
@@ -510,9 +522,9 @@ class PoseBatch:
     def shared_all(self, stack: Stacked) -> None:
         """Return None, as these measurements have different dimensions."""
 
-    def shared(self, i: int, J: FloatArray, H: FloatArray) -> FloatArray:
+    def shared(self, i: int, stack: Stacked) -> FloatArray:
         """Square root ``(d, s)`` of the covariance by the motion from measurement to keyframe, see `Linearized`."""
-        m = self._seen[i]
+        m, J = self._seen[i], stack.J[i, : self.rows[i]]
         if m.motion_cov is None:
             return np.zeros((len(J), 0))
         values, vectors = np.linalg.eigh(m.motion_cov)
@@ -576,7 +588,7 @@ class Observations:
                 used = stack.columns[i] >= 0
                 d = batch.rows[i]
                 H, J = stack.H[i, :d], stack.J[i, :d]
-                shared = batch.shared(i, J, H)
+                shared = batch.shared(i, stack)[:d]
                 found[row] = Linearized(
                     stack.residual[i, :d], J, stack.columns[i][used], H[:, used], shared, bool(stack.behind[i])
                 )

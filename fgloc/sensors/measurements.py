@@ -232,6 +232,7 @@ class PixelMeasurement:
     offset_s: float = 0.0  # how late the stamp was taken to be when the sighting was moved to its keyframe
     blur_s: float = 0.0  # by how long the image moves on a blurred corner is off
     jitter_s: float = 0.0  # sigma of what each stamp is off by on its own
+    sway_rad: float = 0.0  # sigma of the base's roll and pitch in each image, where they are no states
     motion_cov: FloatArray | None = None  # (3, 3) of the motion from the exposure to the keyframe
     cauchy_k: float = 3.0  # Cauchy constant, in units of sigma
     tilting: FloatArray = field(default_factory=lambda: _LEVEL)  # (2,) rad/s: roll and pitch rate of the base

@@ -314,6 +314,7 @@ class CornerMeasurer:
             section.sigma_px,
             ideal,
             blur_s=section.blur_s,
+            sway_rad=section.sway_rad,
             cauchy_k=section.cauchy_k,
         )
 
