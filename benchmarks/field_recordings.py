@@ -189,7 +189,7 @@ def _car_park(source: Path, out: Path) -> None:
             ),
             _odometry(bag, stamps, poses, twists),
             (
-                (t, partial(_scan, bag, t, ranges, intensity))
+                (t, partial(bag.laser_scan, "/scan", t, ranges, intensity, (-0.5 * math.pi, 0.5 * math.pi)))
                 for t, ranges, intensity in zip(scans, data["Laser"], data["Intensity"], strict=True)
             ),
             _points(bag, "/gps", nanoseconds(_EPOCH_S + data["TimeGPS"].ravel()), fixes),
@@ -321,28 +321,6 @@ def _points(bag: BagWriter, topic: str, stamps: IntArray, places: FloatArray) ->
         point = bag.make("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
         message = bag.make("geometry_msgs/msg/PointStamped", header=header, point=point)
         yield t, partial(bag.write, topic, "geometry_msgs/msg/PointStamped", message, t)
-
-
-def _scan(bag: BagWriter, stamp: int, ranges: FloatArray, intensity: FloatArray) -> None:
-    header = bag.make(
-        "std_msgs/msg/Header",
-        stamp=bag.make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9),
-        frame_id="laser",
-    )
-    message = bag.make(
-        "sensor_msgs/msg/LaserScan",
-        header=header,
-        angle_min=-0.5 * math.pi,
-        angle_max=0.5 * math.pi,
-        angle_increment=math.radians(0.5),
-        time_increment=0.0,
-        scan_time=0.2,
-        range_min=0.0,
-        range_max=82.0,
-        ranges=ranges.astype(np.float32),
-        intensities=intensity.astype(np.float32),
-    )
-    bag.write("/scan", "sensor_msgs/msg/LaserScan", message, stamp)
 
 
 def _write_map(out: Path, places: dict[int, Any]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
@@ -402,6 +402,7 @@ class TopicsConfig(Section):
     truth: str | None = None
 
     _cameras: dict[Role, str | None] = PrivateAttr(default_factory=dict)
+    _asked: frozenset[Role] = PrivateAttr(default=frozenset())
 
     @property
     def of_cameras(self) -> Mapping[Role, str | None]:
@@ -422,7 +423,15 @@ class TopicsConfig(Section):
         if role in self._cameras:
             return self._cameras[role]
         given: str | None = getattr(self, role, None)
+        if given is None and role in optional_roles() and role not in self._asked:
+            return "none"
         return "none" if given is None and self._cameras and role in CAMERA_ROLES else given
+
+    def asking(self, roles: Collection[Role]) -> Self:
+        """Copy that looks for topics of these roles, of `optional_roles`, as for those of all others."""
+        other = self.model_copy()
+        other._asked = frozenset(roles)
+        return other
 
 
 class OdometryTopic(Section):
@@ -685,7 +694,10 @@ class Config(SensorSections):
         """Copy the cameras' topics into `recording.topics`, by which a recording is read."""
         if self.cameras and self.camera != CameraConfig():
             raise ValueError("camera is one camera and cameras are several; give one of the two sections")
-        self.__dict__["recording"] = _with_topics(self.recording, self.cameras)
+        recording = _with_topics(self.recording, self.cameras)
+        if asked := {role for role, (name, key) in optional_roles().items() if _has(self, name, key)}:
+            recording = recording.model_copy(update={"topics": recording.topics.asking(asked)})
+        self.__dict__["recording"] = recording
         return self
 
     def of_camera(self, name: str) -> Config:
@@ -755,6 +767,25 @@ def _with_topics(recording: RecordingConfig, cameras: Mapping[str, NamedCameraCo
     topics = recording.topics.model_copy()
     topics._cameras = roles
     return recording.model_copy(update={"topics": topics})
+
+
+def optional_roles() -> dict[Role, tuple[str, str]]:
+    """Roles whose topics are looked for only where a setting of their sensor is given: its section and key, by role.
+
+    Their message type says little: most robots have a laser scanner, and few have reflectors.
+    """
+    return _optional_roles(outside_sensors())
+
+
+@cache
+def _optional_roles(sensors: tuple[type[Any], ...]) -> dict[Role, tuple[str, str]]:
+    asked = [sensor for sensor in sensors if getattr(sensor, "optional", False)]
+    return {stream.role: (sensor.name, sensor.needs) for sensor in asked for stream in sensor.streams}
+
+
+def _has(config: Config, section: str, key: str) -> bool:
+    """Whether a setting of a registered sensor is given."""
+    return bool(getattr(getattr(config, section, None), key, None))
 
 
 def config_type() -> type[Config]:

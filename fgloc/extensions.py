@@ -1,4 +1,4 @@
-"""Sensors by entry point: UWB and GNSS of fgloc itself, and those that other packages declare in ``fgloc.sensors``.
+"""Sensors by entry point: UWB, GNSS and reflectors of fgloc, and those that packages declare in ``fgloc.sensors``.
 
 What such a class has to offer is in `fgloc.sensors.base`; `fgloc.sensors.registry` looks them up by role and event.
 """
@@ -15,6 +15,7 @@ GROUP = "fgloc.sensors"
 BUILT_IN = (
     EntryPoint("uwb", "fgloc.sensors.uwb:Uwb", GROUP),
     EntryPoint("gnss", "fgloc.sensors.gnss:Gnss", GROUP),
+    EntryPoint("reflectors", "fgloc.sensors.reflectors:Reflectors", GROUP),
 )
 """Sensors of fgloc itself that are found in the same way as those of other packages."""
 _NEEDED = ("name", "Config", "streams", "failures", "build", "measure")

@@ -240,7 +240,8 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     kinds = base_roles(facts.roles)
     T_base_sensor = _sensor_pose(facts, config, notes)
     sensors = _sensors(facts, config, landmark_map)
-    placed = bool(sensors) and all(getattr(sensor, "needs", "") for sensor in sensors)  # by places of their own
+    # by places of their own
+    placed = bool(sensors) and all(getattr(s, "needs", "") and not getattr(s, "uses_map", False) for s in sensors)
     if placed and {"image", "sightings"}.isdisjoint(kinds):  # a search for the first pose would wait for a landmark
         landmark_map = None
     if sensors and landmark_map is None:

@@ -276,6 +276,11 @@ class Landmark:
     """Of x, y ``(2, 2)``, of x, y, z ``(3, 3)`` in the map frame, or ``(6, 6)`` of these and the rotation [rad] about
     the marker's own axes; None: not known."""
 
+    @property
+    def is_point(self) -> bool:
+        """Whether it is a point, without an orientation."""
+        return self.size_m == 0.0 and np.array_equal(self.rotation, np.eye(3))
+
     def corners(self) -> FloatArray:
         """Corners ``(4, 3)`` in the map frame, in the order of MarkerCorners."""
         h = 0.5 * self.size_m

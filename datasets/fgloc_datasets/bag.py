@@ -143,6 +143,33 @@ class LandmarkMessages(MessageWriter):
         content = dict(radiation_type=2, field_of_view=0.0, min_range=0.1, max_range=100.0, range=range_m)
         self._write(topic, "sensor_msgs/msg/Range", stamp_ns, received_ns, frame_id, content)
 
+    def laser_scan(
+        self,
+        topic: str,
+        stamp_ns: int,
+        ranges: ArrayLike,
+        intensities: ArrayLike,
+        bearings: tuple[float, float],
+        received_ns: int | None = None,
+        frame_id: str = "laser",
+        beam_s: float = 0.0,
+        max_range: float = 82.0,
+    ) -> None:
+        """``sensor_msgs/LaserScan``: ranges [m] and intensities ``(n,)``, bearings of the first and the last beam."""
+        measured = np.asarray(ranges, dtype=np.float32)
+        content = dict(
+            angle_min=bearings[0],
+            angle_max=bearings[1],
+            angle_increment=(bearings[1] - bearings[0]) / max(len(measured) - 1, 1),
+            time_increment=beam_s,
+            scan_time=0.0,
+            range_min=0.0,
+            range_max=max_range,
+            ranges=measured,
+            intensities=np.asarray(intensities, dtype=np.float32),
+        )
+        self._write(topic, "sensor_msgs/msg/LaserScan", stamp_ns, received_ns, frame_id, content)
+
     def satellite_fix(
         self,
         topic: str,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import yaml
 
-from fgloc.config import CAMERA_ROLES, Config, Role, camera_role, config_of, config_of_file
+from fgloc.config import CAMERA_ROLES, Config, Role, camera_role, config_of, config_of_file, optional_roles
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.landmark_fits import Noise
@@ -234,15 +235,31 @@ def _look(bag: Path) -> _Seen:
 
     with Recording(bag, config.recording) as recording:
         info = inspect_recording(recording, config, watch)
+        roles = recording.roles
         map_path = find_beside(bag, "map.yaml")
         has_map = map_path is not None
         try:
             landmark_map = None if map_path is None else load_map(map_path)
         except FglocError:  # a run says what is wrong with it
             landmark_map = None
+        _look_at_optional(bag, config, roles.values(), watch)
         look = FirstLook(info.roles, events, recording, has_map, landmark_map)
         frames = tuple(name for name in BASE_NAMES if name in recording.frames)
         return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted))
+
+
+_MOST_OPTIONAL = 500  # messages of such a topic
+
+
+def _look_at_optional(bag: Path, config: Config, taken: Collection[str], watch: Callable[[Event], object]) -> None:
+    """Show the first events of topics that are used only if a setting asks for them."""
+    topics = config.recording.topics.asking(optional_roles())
+    with Recording(bag, config.recording.model_copy(update={"topics": topics})) as recording:
+        for role, topic in recording.roles.items():
+            if role in optional_roles() and topic not in taken:
+                for message in islice(recording.messages([topic]), _MOST_OPTIONAL):
+                    for event in recording.decode(message, role):
+                        watch(event)
 
 
 def _with_cameras(bag: Path, config: Config) -> Config:

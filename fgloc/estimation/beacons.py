@@ -46,6 +46,13 @@ class Track:
     cov: FloatArray
     count: int = 1
 
+    def move(self, motion: FloatArray, cov: FloatArray) -> None:
+        """Move by a motion ``(3,)`` of the robot with covariance ``(3, 3)`` (right perturbation)."""
+        back = se2.adjoint(se2.inverse(motion))[:2, :2]
+        x, y = self.point = back @ (self.point - motion[:2])
+        J = np.array([[-1.0, 0.0, y], [0.0, -1.0, -x]])
+        self.cov = back @ self.cov @ back.T + J @ cov @ J.T
+
 
 class SeenBeacons:
     """Positions of beacons in the base frame, each by its own sightings alone, without the map.
@@ -58,11 +65,8 @@ class SeenBeacons:
 
     def move(self, motion: FloatArray, cov: FloatArray) -> None:
         """Move the beacons by a motion ``(3,)`` of the robot with covariance ``(3, 3)`` (right perturbation)."""
-        back = se2.adjoint(se2.inverse(motion))[:2, :2]
         for track in (track for tracks in self._tracks.values() for track in tracks):
-            x, y = track.point = back @ (track.point - motion[:2])
-            J = np.array([[-1.0, 0.0, y], [0.0, -1.0, -x]])
-            track.cov = back @ track.cov @ back.T + J @ cov @ J.T
+            track.move(motion, cov)
 
     def place(self, landmark_id: int) -> FloatArray:
         """Position ``(2,)`` [m] of a beacon in the base frame by the track with most sightings."""

@@ -13,11 +13,12 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.estimation.beacons import Displacement, GaussianSum
 from fgloc.estimation.pose_fit import WHOLE_SHARE, Fit, PoseConsensus, PoseFit, apart, fit_pose
+from fgloc.estimation.unnamed import Constellations
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import FAR_M2, MOST_JOINT, MOST_STEPS, fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import COVARIANCE_FACTOR
-from fgloc.sensors.measurements import LandmarkMeasurement
+from fgloc.sensors.measurements import LandmarkMeasurement, points_of
 from fgloc.stats import ROUNDING
 from fgloc.types import FloatArray, LandmarkMap, MotionMeasurement, MotionReadings, Step
 
@@ -160,6 +161,7 @@ class GlobalSearch:
     Attributes:
         initializing: whether the first pose is still looked for.
         hypotheses: where the robot may be before that is confirmed.
+        constellations: of hits that are of no named beacon.
     """
 
     def __init__(
@@ -177,6 +179,7 @@ class GlobalSearch:
         self._earlier: list[SearchStep] = []  # with keep_all: before those, since the segment began
         self._first = False  # whether the segment has had no pose yet
         self.hypotheses = GaussianSum(config, landmark_map)
+        self.constellations = Constellations(config, landmark_map)
         self._since_ns: int | None = None  # the first sighting of the search
         self._tried_ns = 0  # when a place was looked for last
         self.initializing = True
@@ -196,6 +199,7 @@ class GlobalSearch:
         self._steps.clear()
         self._earlier.clear()
         self.hypotheses.reset()
+        self.constellations.reset()
         self._first = False
         self._since_ns = None
 
@@ -224,19 +228,36 @@ class GlobalSearch:
             forgotten = self._steps.popleft()
             if self._keep_all and self._first:
                 self._earlier.append(forgotten)
-        self.hypotheses.add(motions, sightings, tracked)
+        named = [m for m in sightings if not m.unnamed]
+        self.hypotheses.add(motions, named, tracked)
         place = self.hypotheses.confirmed(tracked)
         if place is not None:
             return self._start(place, gathered=True, displaced=self.hypotheses.displaced())
+        if (place := self._told_by_constellation(step, motions, sightings, tracked)) is not None:
+            return self._start(place, gathered=True, displaced={})
         if self.hypotheses.has_seen and all(m.is_point for c in self._steps for m in c.sightings):
             return None
-        if sightings and self._since_ns is None:
+        if named and self._since_ns is None:
             self._since_ns = step.stamp_ns
-        due = sightings and self._due(step.stamp_ns)
+        due = named and self._due(step.stamp_ns)
         best = self._places.find(list(self._compensated()), tracked is not None) if due else None
         if best is None:
             return None
         return self._start(PoseWithCovariance(best.fit.pose, best.fit.cov), best.by_sensors)
+
+    def _told_by_constellation(
+        self,
+        step: Step,
+        motions: Sequence[MotionMeasurement],
+        sightings: Sequence[LandmarkMeasurement],
+        tracked: PoseWithCovariance | None,
+    ) -> PoseWithCovariance | None:
+        """Place by hits of beacons without identity; None: there is none, or it is not certain."""
+        if motions:
+            self.constellations.move(*fuse(motions))
+        unnamed = [m for m in points_of(sightings) if m.unnamed]
+        self.constellations.take(unnamed)
+        return self.constellations.place(step.stamp_ns, tracked is not None) if unnamed else None
 
     def _due(self, stamp_ns: int) -> bool:
         """Whether it is time to look for a place; bounds the work per second of a search that finds none."""
@@ -277,7 +298,7 @@ class GlobalSearch:
         """Every collected sighting, moved to the newest step."""
         here = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
         for collected, then in zip(reversed(self._steps), _back(here, self._steps), strict=True):
-            for m in collected.sightings:
+            for m in (m for m in collected.sightings if not m.unnamed):
                 yield m.compensated(then.pose, then.cov)
 
 

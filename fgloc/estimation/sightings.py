@@ -23,12 +23,13 @@ from fgloc.estimation.motion import JudgedMotion
 from fgloc.estimation.place import InitialPose
 from fgloc.estimation.pose_fit import Fit, apart, fit_pose
 from fgloc.estimation.tracking import CONTRADICTS, Tracking
+from fgloc.estimation.unnamed import AMBIGUOUS, Naming
 from fgloc.graph.estimators import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition
-from fgloc.sensors.measurements import LandmarkMeasurement
+from fgloc.sensors.measurements import LandmarkMeasurement, points_of
 from fgloc.stats import chi2_bound
 from fgloc.types import Decision, Step
 
@@ -58,6 +59,7 @@ class Association:
         self._contradicting: set[int] = set()
         self._bias = InnovationBias(config.estimator.gate_probability, config.weights.window_s)
         self.modes = LandmarkModes(config, factors)
+        self._naming = Naming(config, factors)
 
     def judge(
         self,
@@ -73,6 +75,9 @@ class Association:
         because the linear one is far too large.
         """
         accepted, rejected, decisions = [], [], []
+        hits = [m for m in points_of(measurements) if m.unnamed]
+        named, nameless = self._naming.name(hits, predicted) if hits else ([], [])
+        measurements = [*(m for m in measurements if not m.unnamed), *named] if hits else measurements
         judged = self._judge(measurements, predicted)
         measurements, judged = self._revise(measurements, judged, predicted)
         shared = [self._share_information(m) for m in measurements]
@@ -100,6 +105,13 @@ class Association:
                 s.measurement.landmark_id
                 for s, d in zip(rejected, decisions, strict=True)
                 if d.reason != "quarantined" and s.measurement.of_landmark
+            )
+            self._contradicting.update(-i for i, one in enumerate(nameless, 1) if one.reason != AMBIGUOUS)
+        for m, nis, reason in ((one.hit, one.nis, one.reason) for one in nameless):
+            rejected.append(LandmarkFactor(m, m, m.cauchy_k))
+            self.rejections[f"{m.counted_as}.{reason}"] += 1
+            decisions.append(
+                Decision(k, stamp_ns, m.row_kind, m.row_id, nis**0.5, nis, m.dof, 0.0, reason, self._gate(m.dof))
             )
         return accepted, rejected, decisions
 
@@ -453,7 +465,7 @@ class SightingJudge:
             self._rejections["sightings.contradict_initial_pose"] += held
         if self._tracking.keeps_initial_pose:
             self.modes.forget()  # they all seem moved from there
-        logged = () if self._tracking.keeps_initial_pose else rejected
+        logged = () if self._tracking.keeps_initial_pose else [s for s in rejected if not s.measurement.unnamed]
         return JudgedSightings(accepted, rejected, logged, decisions, predicted)
 
     def exclude_displaced(self, k: int, step: Step, found: InitialPose) -> list[Decision]:

@@ -12,6 +12,7 @@ from fgloc.config import Config
 from fgloc.estimation.beacons import CARRIED, WRONG_LANDMARK
 from fgloc.estimation.place import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
 from fgloc.estimation.pose_fit import MAX_SIGMA, apart
+from fgloc.estimation.unnamed import AMBIGUOUS
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.sensors.measurements import LandmarkMeasurement
@@ -119,7 +120,7 @@ class Tracking:
         if self.dead_reckoning and not self._contradicting:  # it is the motion that may be wrong by now
             self._given = False
         self._confirming += len(accepted)
-        self._contradicting += len(rejected)
+        self._contradicting += len(rejected) - sum(d.reason == AMBIGUOUS for d in decisions)
         if self._confirming > self._contradicting + _CONFIRMED:
             self._given = False
         if not self.keeps_initial_pose:

@@ -421,11 +421,21 @@ def unread_map(recording: Recording, config: Config) -> str | None:
 def _unused(recording: Recording, config: Config) -> list[str]:
     """Sentences on topics that hold the robot's position, and that nothing reads, or nothing as it is configured."""
     lacking, found = _lacking(config), []
+    optional = {
+        kind: sensor
+        for sensor in outside_sensors()
+        if sensor.name in lacking and getattr(sensor, "optional", False)
+        for stream in sensor.streams
+        for kind in stream.converters
+    }
     read = {kind for sensor in outside_sensors() for stream in sensor.streams for kind in stream.converters}
     for t in recording.topics:
         kind = t.message_type.rpartition("/")[2]
         if t.count and t.role in lacking:
             found.append(f"{t.name} ({t.message_type}) is not used: give {lacking[t.role]} in robot.yaml.")
+        elif t.count and t.role is None and (one := optional.get(t.message_type)) is not None:
+            why = f"{one.purpose}, give {lacking[one.name]}"
+            found.append(f"{t.name} ({t.message_type}) is not used: {why} in robot.yaml.")
         elif t.count and t.role is None and kind in _UNREAD and t.message_type not in read:
             found.append(f"{t.name} ({t.message_type}) is not used: nothing here reads {_UNREAD[kind]}.")
     return found

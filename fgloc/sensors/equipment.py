@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -101,7 +102,7 @@ class LandmarkSensor:
         """Measurements but for those of landmarks that the map does not have, which are counted as rejected."""
         landmark_map, kept = self._context.landmark_map, []
         for m in measurements:
-            if m.of_landmark and (landmark_map is None or m.landmark_id not in landmark_map):
+            if m.of_landmark and not m.unnamed and (landmark_map is None or m.landmark_id not in landmark_map):
                 self._context.rejections[f"{m.counted_as}.unknown_id"] += 1
             else:
                 kept.append(m)
@@ -192,10 +193,13 @@ class MotionCompensation:
             measured.extend(late)
         for sensed in step.sensed:
             now = self._landmarks.known(self._sensor_of[type(sensed)].measure(sensed))
-            if now and sensed.stamp_ns != step.stamp_ns:
-                motion, cov = self._motion_to(step, sensed.stamp_ns)
-                now = [m.compensated(motion, cov) for m in now]
-            measured.extend(now)
+            for stamp_ns, same in groupby(now, key=lambda m: m.stamp_ns):
+                twist = self.twist(step, stamp_ns)
+                made = [m.exposed(twist, 0.0, self._jitter_s) for m in same]
+                if stamp_ns != step.stamp_ns:
+                    motion, cov = self._motion_to(step, stamp_ns)
+                    made = [m.compensated(motion, cov) for m in made]
+                measured.extend(made)
         return measured
 
     def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:

@@ -23,6 +23,7 @@ from fgloc.sensors.cameras import marker_pose_candidates, planar_base_candidates
 from fgloc.types import Camera, FloatArray, Landmark
 
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
+UNNAMED = -1  # landmark of a sighting that does not say of which it is
 YAWS = 24  # that the search for the first pose tries at a place without one
 _LOOKALIKE = 0.1  # tangent of the angle between two directions that may be of one marker, distortion left in
 _AT_REST = np.zeros(3)
@@ -89,6 +90,11 @@ class LandmarkMeasurement(Protocol):
         ...
 
     @property
+    def unnamed(self) -> bool:
+        """Whether it is of a landmark of the map without saying of which; see `fgloc.estimation.unnamed`."""
+        ...
+
+    @property
     def is_point(self) -> bool:
         """Whether it is range and bearing of a point (`PointMeasurement`): explained by the poses on a ring."""
         ...
@@ -131,6 +137,16 @@ class LandmarkMeasurement(Protocol):
     @property
     def information(self) -> float:
         """Weight in comparison with others of its kind."""
+        ...
+
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
+        """Copy with the motion at the exposure, by which the residual depends on the clock.
+
+        Args:
+            twist: ``(3,)`` of the base [m/s, m/s, rad/s].
+            offset_s: how late the stamp was taken to be.
+            jitter_s: sigma of each stamp on its own; used for corners.
+        """
         ...
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
@@ -178,16 +194,6 @@ class LandmarkMeasurement(Protocol):
 class LandmarkSighting(LandmarkMeasurement, Protocol):
     """Measurement of a landmark of the map."""
 
-    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure, by which the residual depends on the clock.
-
-        Args:
-            twist: ``(3,)`` of the base [m/s, m/s, rad/s].
-            offset_s: how late the stamp was taken to be.
-            jitter_s: sigma of each stamp on its own; used for corners.
-        """
-        ...
-
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
         """Copy for a base tilted by ``T`` ``(4, 4)``, at roll and pitch rates ``(2,)`` [rad/s]; only corners change."""
         ...
@@ -212,6 +218,7 @@ class PixelMeasurement:
     model: ClassVar[Model] = Model.CORNERS
     cov: ClassVar[None] = None
     of_landmark: ClassVar[bool] = True
+    unnamed: ClassVar[bool] = False
     is_point: ClassVar[bool] = False
     gives_pose: ClassVar[bool] = True
     in_pixels: ClassVar[bool] = True
@@ -258,7 +265,7 @@ class PixelMeasurement:
         return 1.0 / self.sigma_px**2
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure; see `LandmarkSighting.exposed`."""
+        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s, jitter_s=jitter_s)
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
@@ -325,7 +332,10 @@ class PixelMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointMeasurement:
-    """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out)."""
+    """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out).
+
+    With the id `UNNAMED` it is of any point of the map: which one the predicted pose tells.
+    """
 
     model: ClassVar[Model] = Model.PLANAR
     row_kind: ClassVar[str] = "range_bearing"
@@ -348,6 +358,7 @@ class PointMeasurement:
     twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
     cauchy_k: float = 3.0  # as in PixelMeasurement
+    scan_ns: int = 0  # stamp of the scan that it is of, where hits of one scan have stamps of their own; if unnamed
 
     @classmethod
     def of_point(
@@ -359,6 +370,11 @@ class PointMeasurement:
         J = np.array([[-y / distance**2, x / distance**2], [x / distance, y / distance]])
         polar = J @ cov @ J.T
         return cls(stamp_ns, landmark_id, distance, math.atan2(y, x), 0.5 * (polar + polar.T), cauchy_k=cauchy_k)
+
+    @property
+    def unnamed(self) -> bool:
+        """Whether the sensor does not say of which landmark it is."""
+        return self.landmark_id == UNNAMED
 
     @property
     def point(self) -> FloatArray:
@@ -376,7 +392,7 @@ class PointMeasurement:
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure; see `LandmarkSighting.exposed`."""
+        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s)
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
@@ -466,6 +482,7 @@ class FrameMeasurement:
     row_kind: ClassVar[str] = "marker_pose"
     counted_as: ClassVar[str] = "sightings"
     of_landmark: ClassVar[bool] = True
+    unnamed: ClassVar[bool] = False
     is_point: ClassVar[bool] = False
     gives_pose: ClassVar[bool] = True
     in_pixels: ClassVar[bool] = False
@@ -494,7 +511,7 @@ class FrameMeasurement:
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure; see `LandmarkSighting.exposed`."""
+        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s)
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
@@ -553,6 +570,7 @@ class PoseMeasurement(ABC):
 
     model: ClassVar[Model] = Model.POSE
     of_landmark: ClassVar[bool] = False
+    unnamed: ClassVar[bool] = False
     is_point: ClassVar[bool] = False
     gives_pose: ClassVar[bool] = False
     in_pixels: ClassVar[bool] = False
@@ -631,6 +649,10 @@ class PoseMeasurement(ABC):
     def information(self) -> float:
         """Weight in comparison with others of its kind."""
         return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
+        """The measurement itself: the clock of its sensor is taken as given."""
+        return self
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The measurement, moved to the keyframe; see `LandmarkMeasurement.compensated`."""

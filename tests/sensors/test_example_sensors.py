@@ -337,17 +337,17 @@ def write_cloud(bag, topic, stamp_ns, seen, received_ns):
     ids = np.array([*(i for i, _, _ in seen), 99], dtype=np.float32)
     channel = bag.make("sensor_msgs/msg/ChannelFloat32", name="id", values=ids)
     content = {"points": points, "channels": [channel]}
-    bag._write("/reflectors", "sensor_msgs/msg/PointCloud", stamp_ns, received_ns, "base_link", content)
+    bag._write("/numbered", "sensor_msgs/msg/PointCloud", stamp_ns, received_ns, "base_link", content)
 
 
 @pytest.fixture(scope="module")
 def drives(folders, tmp_path_factory):
     """A drive among beacons, one of which was moved, twice: seen by the built-in sensor and by that of examples/."""
     made = tmp_path_factory.mktemp("drives")
-    Drive("beacons", seconds=18.0, moved=(2,), seed=2).write(made / "beacons")
+    Drive("beacons", seconds=18.0, moved=(2,), seed=2).write(made / "ranges")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(BagWriter, "range_bearing", write_cloud)
-        Drive("beacons", seconds=18.0, moved=(2,), seed=2).write(made / "reflectors")
+        Drive("beacons", seconds=18.0, moved=(2,), seed=2).write(made / "numbered")
     return made
 
 
@@ -355,20 +355,20 @@ def drives(folders, tmp_path_factory):
 def test_landmarks_of_another_package_are_treated_as_those_of_the_built_in_sensor(drives, mode):
     """First pose, gate, shared information, the moved landmark and the fit are the same."""
     results = {}
-    for name in ("beacons", "reflectors"):
+    for name in ("ranges", "numbered"):
         config = load_config(drives / name / "robot.yaml")
         config = with_values(config, "landmarks", NO_CLOCK)
-        if name == "reflectors":
-            config = with_values(config, "reflectors", {"range_sigma_m": 0.05, "bearing_sigma_rad": 0.015})
+        if name == "numbered":
+            config = with_values(config, "beacons", {"range_sigma_m": 0.05, "bearing_sigma_rad": 0.015})
         results[name] = run(drives / name / "bag", drives / name / "map.yaml", config, mode, check=False)
-    ours, theirs = results["beacons"], results["reflectors"]
+    ours, theirs = results["ranges"], results["numbered"]
     assert len(theirs.trajectory) == len(ours.trajectory) > 80
     assert np.abs(theirs.trajectory.poses - ours.trajectory.poses).max() < 1e-4  # points are of 32 bits
-    assert theirs.counts["reflectors"] == ours.counts["range_bearing"] > 50
+    assert theirs.counts["beacons"] == ours.counts["range_bearing"] > 50
     reasons = [[(d.step, d.landmark_id, d.reason) for d in r.decisions if d.landmark_id >= 0] for r in (ours, theirs)]
     assert reasons[0] == reasons[1]
-    assert theirs.rejections["reflectors.unknown_id"] > 50
-    assert "reflectors.quarantined" in theirs.rejections
+    assert theirs.rejections["beacons.unknown_id"] > 50
+    assert "beacons.quarantined" in theirs.rejections
 
 
 # --- Motion -----------------------------------------------------------------------------------------------------------
