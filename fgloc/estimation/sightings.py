@@ -23,7 +23,7 @@ from fgloc.estimation.motion import JudgedMotion
 from fgloc.estimation.place import InitialPose
 from fgloc.estimation.pose_fit import Fit, apart, fit_pose
 from fgloc.estimation.tracking import CONTRADICTS, Tracking
-from fgloc.estimation.unnamed import AMBIGUOUS, Naming
+from fgloc.estimation.unnamed import Naming, contradictions
 from fgloc.graph.estimators import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
@@ -106,7 +106,7 @@ class Association:
                 for s, d in zip(rejected, decisions, strict=True)
                 if d.reason != "quarantined" and s.measurement.of_landmark
             )
-            self._contradicting.update(-i for i, one in enumerate(nameless, 1) if one.reason != AMBIGUOUS)
+            self._contradicting.update(range(-contradictions(nameless), 0))
         for m, nis, reason in ((one.hit, one.nis, one.reason) for one in nameless):
             rejected.append(LandmarkFactor(m, m, m.cauchy_k))
             self.rejections[f"{m.counted_as}.{reason}"] += 1

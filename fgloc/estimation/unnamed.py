@@ -24,7 +24,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.estimation.beacons import CARRIED, Track
+from fgloc.estimation.beacons import CARRIED, WRONG_LANDMARK, Track
 from fgloc.estimation.pose_fit import MAX_SIGMA, apart
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
@@ -38,6 +38,7 @@ from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 
 UNMATCHED, AMBIGUOUS, OUTNUMBERED = "unmatched", "ambiguous", "outnumbered"  # why a hit gets no name
 _SURE = 2.0 * math.log(100.0)  # NIS by which another beacon explains a hit worse: a hundredth as probable
+_STRANGE = 0.3  # prior probability that a bright thing is not in the map
 _MOST_RIVALS = 12  # beacons within reach of one hit: among more, none is tried
 _SLACK_M = 0.5  # beyond the sigmas of the pose, for what the installation may be off
 
@@ -49,6 +50,15 @@ class Nameless:
     hit: PointMeasurement
     nis: float
     reason: str
+
+
+def contradictions(nameless: Sequence[Nameless]) -> int:
+    """Number of named beacons whose contradiction is as probable as that of these hits, if the pose is right.
+
+    Bright things that are not in the map are more common than beacons that were moved.
+    """
+    strange = sum(one.reason != AMBIGUOUS for one in nameless)
+    return int(strange * math.log(_STRANGE) / math.log(WRONG_LANDMARK))
 
 
 class Naming:
@@ -166,7 +176,6 @@ def points_of_map(landmarks: Mapping[int, Landmark]) -> tuple[IntArray, FloatArr
 
 _MATURE = 3  # hits from which on a track stands for something that is there
 _LEAST_BEACONS = 3  # of a place: two are the same from either side
-_STRANGE = 0.3  # prior probability that a bright thing is not in the map
 _CERTAIN = 0.999  # probability of a place from which on it is taken
 _AROUND_M = 10.0  # beyond the beacons, where bright things may be seen
 _SAME, _LOST_M = (

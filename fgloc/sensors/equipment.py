@@ -102,7 +102,7 @@ class LandmarkSensor:
         """Measurements but for those of landmarks that the map does not have, which are counted as rejected."""
         landmark_map, kept = self._context.landmark_map, []
         for m in measurements:
-            if m.of_landmark and not m.unnamed and (landmark_map is None or m.landmark_id not in landmark_map):
+            if m.of_landmark and (landmark_map is None or not (m.unnamed or m.landmark_id in landmark_map)):
                 self._context.rejections[f"{m.counted_as}.unknown_id"] += 1
             else:
                 kept.append(m)

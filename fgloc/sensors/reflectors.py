@@ -30,6 +30,7 @@ from fgloc.types import Event, FloatArray, SensorEvent
 
 _Metres = Annotated[float, Field(ge=-100, le=100)]
 _MOST_TURN_S = 1.0  # that a scanner takes for one scan
+_FARTHEST_M = 500.0  # that a scanner sees a reflector
 _MOST_HITS = 64  # in one scan: of more, what is bright is not a reflector
 
 
@@ -76,7 +77,7 @@ class ScanEvent(SensorEvent):
 def from_scan(message: Any, when: When) -> SensorEvent:
     """From `sensor_msgs/LaserScan`."""
     ranges = np.array(message.ranges, dtype=float)
-    ranges[~((ranges >= message.range_min) & (ranges <= message.range_max))] = np.nan
+    ranges[~((ranges >= message.range_min) & (ranges <= min(message.range_max, _FARTHEST_M)))] = np.nan
     return ScanEvent(
         *when,
         message.header.frame_id,
@@ -92,6 +93,8 @@ def check(event: ScanEvent, gate: GateConfig) -> ScanEvent | str:
     """The event, or why it cannot be used."""
     if not math.isfinite(event.first_rad + event.step_rad + event.step_s):
         return "non_finite"
+    if max(abs(event.first_rad), abs(event.step_rad)) > 2.0 * math.tau:
+        return "bearing_bound"
     if abs(event.step_s) * len(event.ranges) > _MOST_TURN_S:
         return "beam_time"
     if not len(event.intensities):

@@ -8,13 +8,14 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from fgloc import se2
+from fgloc import Live, se2
 from fgloc.calibration.first_settings import first_settings
 from fgloc.cli import app
 from fgloc.config import GateConfig, config_of, config_of_file
 from fgloc.errors import ConfigError, EstimatorError
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.frames import yaw_quaternion
+from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.base import Context
 from fgloc.sensors.maps import write_map
@@ -168,6 +169,7 @@ def test_checks_say_what_is_wrong_with_a_scan():
     assert check(replace(good, intensities=np.zeros(3)), GateConfig()) == "malformed"
     assert check(replace(good, step_rad=math.nan), GateConfig()) == "non_finite"
     assert check(replace(good, step_s=1.0), GateConfig()) == "beam_time"
+    assert check(replace(good, first_rad=-180.0), GateConfig()) == "bearing_bound"
 
 
 def test_a_map_without_points_is_refused():
@@ -305,3 +307,31 @@ def test_without_a_map_the_run_is_dead_reckoning(tmp_path):
     result = run(bag, None, config_of(SETTINGS), "online")
     assert len(result.trajectory) > 10
     assert not result.counts.get("reflectors")
+
+
+def test_scans_are_read_only_if_reflectors_are_asked_for(tmp_path):
+    """Most robots have a laser scanner, and few have reflectors."""
+    bag = Drive(seconds=1.0).write(tmp_path)
+    for settings, roles in (({}, {"odometry", "truth"}), (SETTINGS, {"odometry", "truth", "reflectors"})):
+        with open_recording(bag, config_of(settings).recording) as recording:
+            assert set(recording.roles) == roles
+    off = {**SETTINGS, "recording": {"topics": {"reflectors": "none"}}}
+    with open_recording(bag, config_of(off).recording) as recording:
+        assert "reflectors" not in recording.roles
+
+
+def test_a_live_run_gives_the_poses_of_a_replay(tmp_path):
+    bag, config = Drive(seconds=6.0).write(tmp_path), config_of(SETTINGS)
+    expected = run(bag, tmp_path / "map.yaml", config, "online", check=False)
+    made = []
+    with open_recording(bag, config.recording) as recording:
+        events, roles = list(recording.events()), recording.roles
+    with Live(config, tmp_path / "map.yaml", roles=roles) as live:
+        live.subscribe(made.append)
+        for event in events:
+            live.push(event)
+        assert live.wait(60.0)
+    found = {e.stamp_ns: e.pose for e in made}
+    poses = dict(zip(expected.trajectory.stamps_ns.tolist(), expected.trajectory.poses, strict=True))
+    assert len(found.keys() & poses.keys()) > 15
+    assert all((found[stamp] == poses[stamp]).all() for stamp in found.keys() & poses.keys())
