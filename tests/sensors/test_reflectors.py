@@ -18,6 +18,7 @@ from fgloc.frames import yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.base import Context
+from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.reflectors import Reflectors, ReflectorsConfig, ScanEvent, check
 from fgloc.types import Landmark, LandmarkMap
@@ -172,6 +173,12 @@ def test_checks_say_what_is_wrong_with_a_scan():
     assert check(replace(good, first_rad=-180.0), GateConfig()) == "bearing_bound"
 
 
+def test_without_a_map_nothing_can_name_a_hit():
+    sensor = LandmarkSensor(config_of({}), None, None, None)
+    assert not sensor.known(built(points((1, 1))).measure(scan({180: 2.0}, (180,))))
+    assert sensor.rejections == {"reflectors.unknown_id": 1}
+
+
 def test_a_map_without_points_is_refused():
     marker = Landmark(1, np.zeros(3), np.diag([-1.0, 1.0, -1.0]), 0.2)
     with pytest.raises(ConfigError, match="no points"):
@@ -206,6 +213,20 @@ def test_bright_things_that_the_map_lacks_are_rejected(tmp_path):
     assert metrics.ate_rmse_m < 0.03
     assert result.rejections["reflectors.unmatched"] > 150
     assert {d.landmark_id for d in result.decisions if d.reason == "unmatched"} == {-1}
+
+
+def test_in_a_dense_map_no_hit_gets_a_wrong_name(tmp_path):
+    """Eighty beacons a metre and a half apart, of which the scanner sees some, beside five things that are none."""
+    rng = np.random.default_rng(8)
+    places = rng.uniform(-8.0, 8.0, (80, 2))
+    seen, strange = tuple(map(tuple, places[:12])), tuple(map(tuple, rng.uniform(-6.0, 6.0, (5, 2))))
+    bag = Drive(seen, strange, seconds=16.0).write(tmp_path)
+    write_map(points(*places), tmp_path / "dense.yaml")
+    result = run(bag, tmp_path / "dense.yaml", config_of(SETTINGS), "batch")
+    assert compute_metrics(result, config_of(SETTINGS)).ate_rmse_m < 0.03
+    used = [d.landmark_id for d in result.decisions if d.kind == "reflectors" and not d.reason]
+    assert len(used) > 400
+    assert sum(i >= 12 for i in used) < 0.01 * len(used)
 
 
 def test_a_hit_that_two_beacons_explain_is_rejected(tmp_path):
