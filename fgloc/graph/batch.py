@@ -214,6 +214,7 @@ def ground_covs(marginals: Solved, frames: Sequence[Keyframe]) -> FloatArray:
 # --- The smoother -----------------------------------------------------------------------------------------------------
 
 _SAME = 1e-3  # share by which the error may rise where a step is linearized anew: noise of sightings is made there too
+_SETTLED = 1.2  # factor by which a weight of the wheels may still change
 _HALVINGS = 7  # tries of a step that fits worse, each of half the length: a sixty-fourth of it leads nowhere
 _LARGEST_LOG = math.log(sys.float_info.max) - 1.0
 
@@ -275,6 +276,14 @@ class BatchSmoother:
         self._optimize()
         if not factors.known:
             self._leave_out_unlikely()
+        self._weigh_wheels()
+
+    def _weigh_wheels(self) -> None:
+        """Weigh each motion of the wheels by how far it is from the solution and solve again, until that is settled."""
+        for _ in range(MOST_STEPS):
+            if self._motions is None or self._motions.weigh(self.poses(), self._theta()) < _SETTLED:
+                return
+            self._optimize()
 
     def _begin_at_best(self) -> None:
         """Start an unknown map's solution by dead reckoning where that fits better than the online poses."""
@@ -310,6 +319,7 @@ class BatchSmoother:
         self.accepted = {f.k: tuple(s for s in seen if next(kept)) for f, seen in zip(self.frames, every, strict=True)}
         self._sightings = BatchSightings(self.frames, list(self.accepted.values()), self._factors)
         self._optimize()
+        self._weigh_wheels()
         return sum(map(len, self.accepted.values())) > before
 
     def stamps_ns(self) -> IntArray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -25,8 +27,9 @@ from fgloc.graph.installation import GROUND, Installation
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
 from fgloc.graph.noise import whitening_of
 from fgloc.graph.observation import Linearized, Observations, Stacked
-from fgloc.types import FloatArray, IntArray, MotionMeasurement
+from fgloc.types import FloatArray, IntArray
 
+_WHEELS_CAUCHY_K = 3.0  # sigmas, as of sightings in fits of a pose
 _AT_ONCE = 300  # keyframes whose sightings are linearized at the same time; each may have 100 kB of Jacobians
 
 
@@ -36,50 +39,67 @@ class BatchMotions:
     def __init__(self, frames: Sequence[Keyframe], installation: Installation) -> None:
         """Prepare the motions that end at these keyframes."""
         self._n = installation.constants
-        self._plain: list[gtsam.NonlinearFactor] = []
-        self._at: list[int] = []  # rows of the keyframes that the installed ones end at
-        self._keys: list[tuple[int, int]] = []
-        installed: list[MotionMeasurement] = []
-        for i, frame in enumerate(frames):
-            for motion in frame.motions:
-                if any(name in installation.index for name in motion.depends_on):
-                    self._at.append(i)
-                    self._keys.append((pose_key(frame.k - 1), pose_key(frame.k)))
-                    installed.append(motion)
-                else:
-                    self._plain.append(motion_factor(frame.k, motion))
-        self._motions = np.array([m.motion for m in installed]).reshape(-1, 3)
-        self._linear = list(self._prepared(installed, installation))
-
-    def _prepared(
-        self, motions: Sequence[MotionMeasurement], installation: Installation
-    ) -> Iterator[gtsam.JacobianFactor]:
-        if not motions:
-            return
-        W = whitenings([m.cov for m in motions])
-        by_first = -W @ np.array([se2.adjoint(se2.inverse(m.motion)) for m in motions])
-        noise = gtsam.noiseModel.Unit.Create(3)
-        for (first, second), m, w, A in zip(self._keys, motions, W, by_first, strict=True):
-            H, residual = np.zeros((3, self._n)), np.zeros(3)
+        held = [(i, frame.k, m) for i, frame in enumerate(frames) for m in frame.motions]
+        self._at = np.array([i for i, _, _ in held], dtype=np.int64)  # rows of the keyframes that they end at
+        self._k = [k for _, k, _ in held]
+        self._all = [m for _, _, m in held]
+        self._motions = np.array([m.motion for m in self._all]).reshape(-1, 3)
+        self._of_wheels = np.array([m.source == "wheels" for m in self._all], dtype=bool)
+        self._W = whitenings([m.cov for m in self._all]) if held else np.zeros((0, 3, 3))
+        self._H, self._r = np.zeros((len(held), 3, self._n)), np.zeros((len(held), 3))
+        self._installed = [any(name in installation.index for name in m.depends_on) for m in self._all]
+        for i, m in enumerate(self._all):
             for name, (derivative, assumed) in m.depends_on.items():
                 if name in installation.index:
-                    column = -w @ derivative
-                    H[:, installation.index[name]] = column
-                    residual -= column * assumed
-            yield gtsam.JacobianFactor(first, A, second, w, INSTALLATION, H, -residual, noise)
+                    column = -self._W[i] @ derivative
+                    self._H[i, :, installation.index[name]] = column
+                    self._r[i] -= column * assumed
+        self._scales = np.ones(len(held))  # on their covariances
+
+    def weigh(self, poses: FloatArray, theta: FloatArray) -> float:
+        """Scale the covariances of the wheels by how far each of their motions is from a solution.
+
+        That is Cauchy's kernel, by weights that are computed anew about each solution: of wheels that slip for a moment
+        the fixes around it say so.
+
+        Source: Holland, Welsch 1977, "Robust regression using iteratively reweighted least-squares".
+
+        Args:
+            poses: ``(n, 3)`` of the keyframes.
+            theta: ``(p,)`` installation.
+
+        Returns:
+            The largest change of a scale, as a factor.
+        """
+        if not self._of_wheels.any():
+            return 1.0
+        apart = np.array([se2.log(d) for d in se2.between_array(self._led_to(poses), poses[self._at])])
+        white = np.einsum("nij,nj->ni", self._W, apart) + self._H @ theta + self._r
+        squares = np.einsum("ni,ni->n", white, white) * (2.0 / se2.DOF)  # as if of two dimensions
+        before = self._scales
+        self._scales = np.where(self._of_wheels, 1.0 + squares / _WHEELS_CAUCHY_K**2, 1.0)
+        return float(np.exp(np.abs(np.log(self._scales / before)).max()))
+
+    def _led_to(self, poses: FloatArray) -> FloatArray:
+        return se2.compose_array(poses[self._at - 1], self._motions)
 
     def factors(self, poses: FloatArray) -> Iterator[gtsam.NonlinearFactor]:
-        """All factors, linear about poses ``(n, 3)`` of the keyframes and what the motions lead to from there."""
-        yield from self._plain
-        before = poses[np.array(self._at, dtype=np.int64) - 1]
-        after = se2.compose_array(before, self._motions)
-        installed = gtsam.Values()
-        installed.insert(INSTALLATION, np.zeros(self._n))
-        ends = zip(self._keys, self._linear, before.tolist(), after.tolist(), strict=True)
-        for (first, second), linear, start, end in ends:
-            values = gtsam.Values(installed)
-            values.insert(first, gtsam.Pose2(*start))
-            values.insert(second, gtsam.Pose2(*end))
+        """All; those with the installation linear about poses ``(n, 3)`` and what the motions lead to from there."""
+        constants = gtsam.Values()
+        constants.insert(INSTALLATION, np.zeros(self._n))
+        before, after, scales = poses[self._at - 1], self._led_to(poses), self._scales.tolist()
+        for i, (k, m, installed) in enumerate(zip(self._k, self._all, self._installed, strict=True)):
+            if not installed:
+                yield motion_factor(k, m if scales[i] == 1.0 else replace(m, cov=m.cov * scales[i]))
+                continue
+            first, second = pose_key(k - 1), pose_key(k)
+            values = gtsam.Values(constants)
+            values.insert(first, gtsam.Pose2(*before[i]))
+            values.insert(second, gtsam.Pose2(*after[i]))
+            W, H = self._W[i], self._H[i]
+            A = -W @ se2.adjoint(se2.inverse(m.motion))
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, math.sqrt(scales[i]))
+            linear = gtsam.JacobianFactor(first, A, second, W, INSTALLATION, H, -self._r[i], noise)
             yield gtsam.LinearContainerFactor(linear, values)
 
 
