@@ -27,8 +27,9 @@ from robot_world import (
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.config import MotionConfig
+from fgloc.config import BatchConfig, MotionConfig
 from fgloc.estimation.pose_fit import fit_pose
+from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
 from fgloc.sensors.markers.images import CornersEvent
@@ -70,6 +71,27 @@ def test_a_drive_is_followed_closely(kind, settings, bound_m):
         assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates]) < bound_m
         unconfirmed = [] if kind == "corners" or estimates[0].mode is Mode.OK else [Mode.UNCONFIRMED]
         assert modes(estimates) == [*unconfirmed, Mode.OK]
+
+
+def test_a_robot_that_sways_on_a_flat_floor_keeps_its_markers():
+    sizes = []
+    for seed in range(3):
+        world, chain, estimates = drive("corners", seed=seed, seconds=10.0, sway_rad=0.004)
+        assert chain.localizer.rejections["sightings.gate"] < 0.01 * chain.localizer.counts["corners"]
+        sizes.append(np.mean([nees(e, world.truth(e.stamp_ns)) for e in estimates]) / 3)
+    assert np.mean(sizes) < 1.5
+
+
+def test_slips_hardly_bend_the_constants_of_the_batch():
+    slips, off = tuple((t, t + 0.1) for t in np.arange(2.0, 18.0, 2.0)), []
+    for seed in range(2):
+        world_map = room()
+        chain = Chain(config(), world_map, keep_all=True)
+        chain.run(World(world_map, seed=seed, slips=slips).events())
+        localizer = chain.localizer
+        smoother = BatchSmoother(localizer.estimator.log, localizer.factors, BatchConfig(), 0.9999)
+        off.append(smoother.installed().mean[localizer.factors.installation.index["wheels.radius"]])
+    assert max(map(abs, off)) < 0.04  # of the radius; 0.07 if slips count as much as other motions
 
 
 def test_nees_is_within_its_chi2_bounds_over_seeds():

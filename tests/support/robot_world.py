@@ -11,7 +11,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.estimation.localizer import Localizer
-from fgloc.frames import yaw_quaternion
+from fgloc.frames import rotation_of, yaw_quaternion
 from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.intake.validation import EventValidator
 from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
@@ -73,10 +73,12 @@ def truth_at(t: float, turned: float = 0.0) -> np.ndarray:
     return np.array([r * math.sin(angle), -r * math.cos(angle), se2.wrap(angle)])
 
 
-def project(pose, landmark: Landmark) -> np.ndarray | None:
-    """Corners ``(4, 2)`` of a marker that the camera sees from the front and whole, else None."""
+def project(pose, landmark: Landmark, tilt=(0.0, 0.0)) -> np.ndarray | None:
+    """Corners ``(4, 2)`` of a marker that the camera sees from the front and whole, else None; ``tilt``: roll, pitch."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    T = np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1.0]]) @ T_BASE_CAM
+    tilted = np.eye(4)
+    tilted[:3, :3] = rotation_of((*tilt, 0.0))
+    T = np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1.0]]) @ tilted @ T_BASE_CAM
     points = (landmark.corners() - T[:3, 3]) @ T[:3, :3]
     ray = landmark.position - T[:3, 3]
     if points[:, 2].min() < 0.2 or -ray @ landmark.rotation[:, 2] < 0.3 * np.linalg.norm(ray):
@@ -97,8 +99,9 @@ def polar(pose, landmark: Landmark) -> tuple[float, float]:
 class World:
     """Events of one drive: odometry at 20 Hz, commands at 10 Hz, sightings at ``rate`` Hz.
 
-    ``blind`` are intervals [s] without sightings, ``dumb`` without motion; ``kidnap_s`` is when the robot is carried to
-    the other side of the circle; ``late_s`` is how long sightings are on their way.
+    ``blind`` are intervals [s] without sightings, ``dumb`` without motion, ``slips`` in which wheels turn five times
+    as fast as the robot drives; ``kidnap_s`` is when the robot is carried to the other side of the circle; ``late_s`` is
+    how long sightings are on their way; ``sway_rad`` the sigma of roll and pitch in each image.
     """
 
     map: LandmarkMap
@@ -107,6 +110,8 @@ class World:
     rate: int = 10
     blind: tuple[tuple[float, float], ...] = ()
     dumb: tuple[tuple[float, float], ...] = ()
+    slips: tuple[tuple[float, float], ...] = ()
+    sway_rad: float = 0.0
     kidnap_s: float = math.inf
     late_s: float = 0.0
     range_scale: float = 1.0  # reported over true
@@ -143,7 +148,8 @@ class World:
 
     def _odometry(self, stamp: int) -> OdometryEvent:
         spread = math.sqrt(SPEED / 0.05)  # white noise of the twist that adds up to the density of the configuration
-        v = SPEED + self._rng.normal(0.0, NOISE["x_per_sqrt_m"] * spread)
+        slip = 5.0 if _within((stamp - self.start_ns) * 1e-9 + self.start_s, self.slips) else 1.0
+        v = slip * SPEED + self._rng.normal(0.0, NOISE["x_per_sqrt_m"] * spread)
         omega = TURN + self._rng.normal(0.0, NOISE["yaw_per_sqrt_m"] * spread)
         x, y, yaw = self.truth(stamp)
         twist = np.array([v, 0.0, 0.0]), np.array([0.0, 0.0, omega])
@@ -154,7 +160,8 @@ class World:
         pose, received = self.truth(stamp), stamp + round(self.late_s * 1e9)
         landmarks = (self.shown or self.map).landmarks.values()
         if self.sees_corners:
-            seen = [(m.landmark_id, c) for m in landmarks if (c := project(pose, m)) is not None]
+            tilt = self._rng.normal(0.0, self.sway_rad, 2) if self.sway_rad else (0.0, 0.0)
+            seen = [(m.landmark_id, c) for m in landmarks if (c := project(pose, m, tilt)) is not None]
             noisy = [MarkerCorners(i, c + self._rng.normal(0.0, SIGMA_PX, (4, 2))) for i, c in seen]
             return CornersEvent(stamp, received, "/tags", "cam", tuple(noisy))
         made = []
