@@ -74,7 +74,7 @@ def truth_at(t: float, turned: float = 0.0) -> np.ndarray:
 
 
 def project(pose, landmark: Landmark, tilt=(0.0, 0.0)) -> np.ndarray | None:
-    """Corners ``(4, 2)`` of a marker that the camera sees from the front and whole, else None; ``tilt``: roll, pitch."""
+    """Corners ``(4, 2)`` of a marker that the camera, tilted by roll and pitch, sees from the front and whole, or None."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     tilted = np.eye(4)
     tilted[:3, :3] = rotation_of((*tilt, 0.0))
@@ -100,8 +100,8 @@ class World:
     """Events of one drive: odometry at 20 Hz, commands at 10 Hz, sightings at ``rate`` Hz.
 
     ``blind`` are intervals [s] without sightings, ``dumb`` without motion, ``slips`` in which wheels turn five times
-    as fast as the robot drives; ``kidnap_s`` is when the robot is carried to the other side of the circle; ``late_s`` is
-    how long sightings are on their way; ``sway_rad`` the sigma of roll and pitch in each image.
+    as fast as the robot drives; ``kidnap_s`` is when the robot is carried to the other side of the circle; ``late_s``
+    is how long sightings are on their way; ``sway_rad`` the sigma of roll and pitch in each image.
     """
 
     map: LandmarkMap
