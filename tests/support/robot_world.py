@@ -74,7 +74,7 @@ def truth_at(t: float, turned: float = 0.0) -> np.ndarray:
 
 
 def project(pose, landmark: Landmark, tilt=(0.0, 0.0)) -> np.ndarray | None:
-    """Corners ``(4, 2)`` of a marker that the camera, tilted by roll and pitch, sees from the front and whole, or None."""
+    """Corners ``(4, 2)`` of a marker that a camera tilted by roll and pitch sees from the front and whole, or None."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     tilted = np.eye(4)
     tilted[:3, :3] = rotation_of((*tilt, 0.0))
