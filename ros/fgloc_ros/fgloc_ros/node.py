@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
+from array import array
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeAlias
 
 import rclpy
-from rcl_interfaces.msg import ParameterDescriptor, ParameterType
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.task import Future
@@ -29,6 +32,24 @@ from fgloc_ros.transport import RosTransport
 _AGAIN_S, _LONGEST_S = 1.0, 30.0  # pause after a run that failed; doubled each time up to this
 _LASTED_S = 60.0  # a run that lasted so long starts the pauses anew
 _SAVED = "state.json"
+_POSE = "initial_pose"
+
+
+_Transition: TypeAlias = Callable[["FglocNode", LifecycleState], TransitionCallbackReturn]
+
+
+def _logged(transition: _Transition) -> _Transition:
+    """The transition, and the reason in the log if it fails: rclpy does not tell it."""
+
+    @wraps(transition)
+    def run(node: FglocNode, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return transition(node, state)
+        except Exception as error:
+            node.get_logger().error(f"{transition.__name__}: {type(error).__name__}: {error}")
+            raise
+
+    return run
 
 
 class FglocNode(LifecycleNode):
@@ -42,11 +63,11 @@ class FglocNode(LifecycleNode):
         """Declare parameters and services; ``options`` are those of `rclpy.node.Node`."""
         super().__init__("fgloc", **options)
         for name, (default, description) in PARAMETERS.items():
-            kind = ParameterType.PARAMETER_DOUBLE_ARRAY if name == "initial_pose" else None
-            descriptor = ParameterDescriptor(description=description, dynamic_typing=False)
-            if kind is not None:
-                descriptor.type = kind
-                self.declare_parameter(name, rclpy.Parameter.Type.DOUBLE_ARRAY, descriptor)
+            is_pose = name == _POSE  # its numbers may be whole
+            descriptor = ParameterDescriptor(description=description, dynamic_typing=is_pose)
+            if is_pose:  # rclpy takes an empty list for one of bytes; without a value the others could not be asked for
+                if self.declare_parameter(name, None, descriptor).value is None:
+                    self.set_parameters([rclpy.Parameter(name, rclpy.Parameter.Type.DOUBLE_ARRAY, [])])
             else:
                 self.declare_parameter(name, default, descriptor)
         for role in role_names():
@@ -58,6 +79,7 @@ class FglocNode(LifecycleNode):
         self._run: _Run | None = None
         self._folder: TemporaryDirectory[str] | None = None
         self._pool = ThreadPoolExecutor(1, "fgloc-service")
+        aside = ReentrantCallbackGroup()  # a service that waits would hold up all of the node's default group
         for name, work in (
             ("global_search", lambda live: live.search()),
             ("save_state", self._save),
@@ -65,11 +87,12 @@ class FglocNode(LifecycleNode):
             ("reload_map", self._reload_map),
             ("reset", lambda live: live.reset()),
         ):
-            self.create_service(Trigger, f"~/{name}", self._service(work))
+            self.create_service(Trigger, f"~/{name}", self._service(work), callback_group=aside)
         self._answer_invalid_transitions()
 
     # --- transitions ---
 
+    @_logged
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read parameters, files and map; announce the outputs."""
         try:
@@ -84,6 +107,7 @@ class FglocNode(LifecycleNode):
         self._folder = TemporaryDirectory(prefix="fgloc-")
         return super().on_configure(state)
 
+    @_logged
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin a run, or go on with the one before."""
         done = super().on_activate(state)  # publishers publish from now on
@@ -93,6 +117,7 @@ class FglocNode(LifecycleNode):
         self._run = _Run(self, self._settings, self._transport, self._state(), process)
         return done
 
+    @_logged
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """End the run; its state is kept."""
         self._end_run()
@@ -159,7 +184,8 @@ class FglocNode(LifecycleNode):
     def _read_parameters(self) -> Settings:
         names = [*PARAMETERS, *(f"topics.{role}" for role in role_names())]
         values = {name: self.get_parameter_or(name).value for name in names}
-        values["initial_pose"] = list(values["initial_pose"] or ())
+        if isinstance(values[_POSE], array):  # as rclpy has numbers
+            values[_POSE] = values[_POSE].tolist()
         space = self.get_namespace().rstrip("/")
 
         def remapped(role: str) -> str | None:
@@ -183,6 +209,7 @@ class FglocNode(LifecycleNode):
     def _service(self, work: Callable[[Live], str | None]) -> Callable[[Any, Any], Any]:
         async def serve(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             done: Future = Future(executor=self.executor)
+            done.add_done_callback(lambda _: None)  # wakes the executor, which else waits for the next message
 
             def call() -> None:
                 try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ def settings(
     map_file, state = (Path(parameters[key]) if parameters[key] else None for key in ("map", "state"))
     config = load_config(Path(parameters["config"])) if parameters["config"] else Config()
     config = _with_topics(config, parameters, resolve, remapped)
-    config = _with_initial_pose(config, list(parameters["initial_pose"]))
+    config = _with_initial_pose(config, parameters["initial_pose"])
     if parameters["base_frame"]:
         config = _changed(config, "recording", base_frame=parameters["base_frame"])
     rate, ahead = float(parameters["rate"]), float(parameters["transform_tolerance"])
@@ -106,12 +106,14 @@ def _with_topics(
     return _changed(config, "recording", topics=config.recording.topics.model_copy(update=topics))
 
 
-def _with_initial_pose(config: Config, given: list[float]) -> Config:
-    if not given:
+def _with_initial_pose(config: Config, given: Any) -> Config:
+    if given is None or (not isinstance(given, (bool, int, float)) and not len(given)):
         return config
-    if len(given) != 3 or not all(map(math.isfinite, given)):
+    pose = given if isinstance(given, Sequence) and not isinstance(given, (str, bytes)) else ()
+    numbers = [float(value) for value in pose if isinstance(value, (int, float)) and math.isfinite(value)]
+    if not len(numbers) == len(pose) == 3:
         raise ConfigError(f"initial_pose {given}: expected x, y [m] and yaw [rad], such as [1.5, -0.2, 3.14]")
-    return _changed(config, "estimator", initial_pose=tuple(map(float, given)))
+    return _changed(config, "estimator", initial_pose=tuple(numbers))
 
 
 def _changed(config: Config, section: str, **values: Any) -> Config:

@@ -1,4 +1,4 @@
-"""Network of a live run by rclpy: the node's topics, its clock, and messages as rclpy has them."""
+"""Network of a live run by rclpy: the node's topics, its clock, and messages as bytes or as rclpy has them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rosidl_runtime_py import set_message_fields
 from rosidl_runtime_py.utilities import get_message
 
+from fgloc.errors import WireError
 from fgloc.live.wire.outputs import Outputs
 from fgloc.live.wire.transport import Publication, received_ns
+from fgloc.recording.messages import Messages
 from fgloc.recording.reader import TF_TYPES
 
 _CREATE_S = 0.05  # time between two looks for subscriptions to be made, in the thread of the executor
@@ -30,12 +32,13 @@ _DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heard:
-    """One message as rclpy delivers it."""
+    """One message as rclpy delivers it: serialized, and the types that read it; else without them."""
 
     topic: str
     message_type: str
     message: Any
     source_ns: int
+    messages: Messages | None = None
     publisher: str = ""  # rclpy does not say who
 
 
@@ -90,6 +93,8 @@ class RosTransport:
         self._wanted: list[tuple[str, str, Callable[[Any], None], bool]] = []
         self._subscriptions: list[Any] = []
         self._ending: list[Any] = []
+        self._failure: Exception | None = None
+        self._messages = Messages()
         self._lock = threading.Lock()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulation time stands still
         self._timer = node.create_timer(_CREATE_S, self._subscribe, clock=steady)
@@ -134,7 +139,14 @@ class RosTransport:
         return _NodeClock(self._node.get_clock())
 
     def publications(self) -> tuple[Publication, ...]:
-        """Topics with publishers in the node's namespace, with those that it names, and /tf."""
+        """Topics with publishers in the node's namespace, with those that it names, and /tf.
+
+        Raises:
+            WireError: a message of a topic that is read could not be taken in.
+        """
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise WireError(f"a message could not be taken in: {failure!r}") from failure
         space = self._node.get_namespace().rstrip("/") + "/"
         own = self.full_name("~/")
         found = set()
@@ -158,8 +170,13 @@ class RosTransport:
             self._wanted.append((topic, message_type, on_message, latched))
 
     def decode(self, heard: Heard) -> Any:
-        """Content of a message; transforms from the map are left out, for they are of localizers, as this is."""
+        """Content of a message; transforms from the map are left out, for they are of localizers, as this is.
+
+        Raises whatever damaged bytes lead to.
+        """
         message = heard.message
+        if heard.messages is not None:
+            message = heard.messages.decode(heard.message_type, message)
         if heard.message_type in TF_TYPES:
             message.transforms = [t for t in message.transforms if t.header.frame_id.lstrip("/") != self._map_frame]
         return message
@@ -183,25 +200,46 @@ class RosTransport:
         with self._lock:
             wanted, self._wanted = self._wanted, []
         for topic, message_type, on_message, latched in wanted:
-            depth = _LARGE_DEPTH if message_type in _LARGE else _LATCHED_DEPTH if latched else _READ_DEPTH
-            reliability = ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT
-            subscription = self._node.create_subscription(
-                get_message(message_type),
-                topic,
-                _delivery(topic, message_type, on_message),
-                _profile(depth, reliability, latched),
-                qos_overriding_options=None if latched else QoSOverridingOptions.with_default_policies(),
-            )
+            try:
+                subscription = self._subscription(topic, message_type, on_message, latched)
+            except Exception as error:  # its messages are not installed, or the parameters of its QoS are none
+                self._node.get_logger().error(f"{topic} ({message_type}) cannot be read: {error}")
+                continue
             with self._lock:
                 self._subscriptions.append(subscription)
 
+    def _subscription(self, topic: str, message_type: str, on_message: Callable[[Any], None], latched: bool) -> Any:
+        depth = _LARGE_DEPTH if message_type in _LARGE else _LATCHED_DEPTH if latched else _READ_DEPTH
+        reliability = ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT
+        messages = self._messages_of(topic, message_type)
 
-def _delivery(topic: str, message_type: str, on_message: Callable[[Any], None]) -> Callable[[Any, Any], None]:
-    def deliver(message: Any, info: Mapping[str, int]) -> None:
-        source_ns = info["source_timestamp"] or time.time_ns()  # 0: the middleware does not say
-        on_message(Heard(topic, message_type, message, source_ns))
+        def deliver(message: Any, info: Mapping[str, int]) -> None:
+            source_ns = info["source_timestamp"] or time.time_ns()  # 0: the middleware does not say
+            try:
+                on_message(Heard(topic, message_type, message, source_ns, messages))
+            except Exception as error:  # raised by the next look for topics: the run begins again, the executor goes on
+                self._failure = error
 
-    return deliver
+        return self._node.create_subscription(
+            get_message(message_type),
+            topic,
+            deliver,
+            _profile(depth, reliability, latched),
+            qos_overriding_options=None if latched else QoSOverridingOptions.with_default_policies(),
+            raw=messages is not None,
+        )
+
+    def _messages_of(self, topic: str, message_type: str) -> Messages | None:
+        """Types of fgloc's that read a topic's messages; None: it has none like its publishers', rclpy reads them.
+
+        A damaged message is counted by the intake; rclpy raises, or asks for the memory that a damaged length names.
+        """
+        own = self._messages.type_hash(message_type)
+        infos = self._node.get_publishers_info_by_topic(topic)
+        said = {str(info.topic_type_hash) for info in infos} - {"INVALID"}  # from before Iron
+        if own and said <= {own}:
+            return self._messages
+        return Messages.of_hash(message_type, said.pop()) if own and len(said) == 1 else None
 
 
 def _profile(depth: int, reliability: ReliabilityPolicy, latched: bool) -> QoSProfile:
