@@ -156,7 +156,8 @@ def two_robots(kinds: Sequence[str]) -> Iterator[Row]:
             shares.append(share)
             print(
                 f"{kind} {name}: {wrong} keyframes differ, by {max(off, default=np.nan):.4g} mm; {share:.3f} there; "
-                f"reads of the other {reads}; {one['tf']} own messages of tf, {one['shared_tf']} shared; {one['code']}",
+                f"reads of the other {reads}; {one['tf']} own messages of tf, {one['shared_tf']} shared; "
+                f"{one['code']}; {one['dropped']}",
                 file=sys.stderr,
             )
     yield Row("ros.two_robots", crossed, n=2 * len(kinds))

@@ -27,6 +27,7 @@ PACKAGE = ROOT / "ros" / "fgloc_ros"
 PATIENCE_S = 60.0
 _RUN = "from fgloc_ros.node import main; main()"
 _QUIET_S = 2.0  # without a pose: all have come
+_ANSWER_S = 5.0
 _CLOCK_S = 0.01
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
@@ -100,11 +101,17 @@ class NodeProcess:
         return bool(self._peer.call(ChangeState, f"{self.name}/change_state", request, timeout_s).success)
 
     def state(self) -> str:
-        """Label of the present state."""
+        """Label of the present state; asked again, for one that was killed is found for a while and does not answer."""
         from lifecycle_msgs.srv import GetState
 
-        found = self._peer.call(GetState, f"{self.name}/get_state", GetState.Request())
-        return str(found.current_state.label)
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                found = self._peer.call(GetState, f"{self.name}/get_state", GetState.Request(), _ANSWER_S)
+                return str(found.current_state.label)
+            except TimeoutError:
+                if time.monotonic() > deadline:
+                    raise TimeoutError(f"{self.name} does not answer:\n{''.join(self.log)}") from None
 
     def start(self) -> None:
         """Configure and activate."""
@@ -464,6 +471,7 @@ def two(bags: Sequence[str], parameters: Sequence[Mapping[str, Any]]) -> dict[st
         heard = {name: peer.hear(f"/{name}/fgloc/pose", _POSE) for name in names}
         frames = {name: peer.hear(f"/{name}/tf", "tf2_msgs/msg/TFMessage") for name in names}
         shared = peer.hear("/tf", "tf2_msgs/msg/TFMessage")
+        diagnostics = peer.hear("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         given = zip(names, parameters, strict=True)
         nodes = {name: NodeProcess(peer, name, {**p, "use_sim_time": True}, *own_tf) for name, p in given}
         players = []
@@ -490,11 +498,18 @@ def two(bags: Sequence[str], parameters: Sequence[Mapping[str, Any]]) -> dict[st
                 "reads": [topic for topic, _ in reads[name]],
                 "tf": len(frames[name]),
                 "shared_tf": len(shared),
+                "dropped": dropped(diagnostics, f"{name}/fgloc"),
                 "code": codes[name],
                 "log": nodes[name].log,
             }
             for name in names
         }
+
+
+def dropped(heard: Sequence[tuple[int, Any]], name: str) -> dict[str, str]:
+    """Messages that a node has dropped, by its last diagnostics."""
+    states = [status for _, message in heard for status in message.status if status.name.startswith(f"{name}:")]
+    return {one.key: one.value for one in (states[-1].values if states else ()) if one.key.startswith("dropped")}
 
 
 def lifecycle(bag: str, parameters: Mapping[str, Any], count: int, seed: int) -> dict[str, Any]:

@@ -231,6 +231,30 @@ def test_two_publishers_of_one_topic_are_told_apart():
     assert 30 < dropped < 60  # as long as the first might still come
 
 
+def test_an_odometry_that_is_late_has_its_frame_on_tf():
+    """Its stamps are 0.4 s behind the clock; the poses that are kept reach back 0.125 s."""
+    topics = {"image": "none", "sightings": "none"}
+    config = Config.model_validate({"recording": {"topics": topics}, "estimator": {"initial_pose": (5.0, 2.0, 0.0)}})
+    with Session(config) as session, Participant(DOMAIN) as base:
+        writer = base.writer("/odom", "nav_msgs/msg/Odometry")
+        assert wait_until(lambda: writer.readers)
+        for k in range(150):  # 3 s
+            stamp = time.time_ns() - 400_000_000
+            message = {
+                "header": {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "odom"},
+                "child_frame_id": "base_link",
+                "pose": {"pose": {"position": {"x": 0.02 * k}, "orientation": {"w": 1.0}}},
+                "twist": {"twist": {"linear": {"x": 1.0}}},
+            }
+            writer.publish(message)
+            time.sleep(0.02)
+    assert len(session.heard["/tf"]) > 50
+    (last,) = session.heard["/tf"][-1][1].transforms
+    t = last.transform.translation
+    assert (last.header.frame_id, last.child_frame_id) == ("map", "odom")
+    assert (t.x, t.y) == pytest.approx((5.0, 2.0), abs=0.1)
+
+
 def test_ambiguous_topics_are_an_error_and_missing_ones_are_waited_for():
     told = []
     with Participant(DOMAIN) as one, Participant(DOMAIN) as other:

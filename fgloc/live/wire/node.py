@@ -417,11 +417,16 @@ class Node:
         The transform of an odometry's pose that is newer than those asked for is the one before: it changes only by
         the odometry's error.
         """
+        assert self.live is not None
         ahead_ns = round(self._as.tf_ahead_s * 1e9)
         if self._odom.latest() is None:
             return self._outputs.transform(now.stamp_ns + ahead_ns, now.pose, base)
-        for odom in self._odom.take(now.stamp_ns):
+        taken = self._odom.take(now.stamp_ns)
+        for odom in taken:
             then = self._recent.at(odom.stamp_ns)
+            if then is None and odom is taken[-1] and self._recent.is_before(odom.stamp_ns):
+                late = self.live.pose_at(odom.stamp_ns)  # a slow network, or a clock that is behind
+                then = None if late is None else late.pose
             if then is not None:
                 self._T_map_odom = {odom.frame: odom_in_map(then, odom.T_odom_base)}
             if (known := self._T_map_odom.get(odom.frame)) is not None:

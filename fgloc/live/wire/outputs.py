@@ -176,6 +176,10 @@ class RecentPoses:
         poses = np.array([p.pose for p in self._poses])
         return np.asarray(se2.interpolate(stamps, poses, np.array([stamp_ns], dtype=np.int64))[0])
 
+    def is_before(self, stamp_ns: int) -> bool:
+        """Whether a time is before that of all poses that are kept."""
+        return bool(self._poses) and stamp_ns < self._poses[0].stamp_ns
+
     def _correct(self, keyframe_ns: int) -> None:
         """Move all poses so that the one at the new keyframe's time is that of the keyframe."""
         stamp_ns = max(keyframe_ns, self._poses[0].stamp_ns)
