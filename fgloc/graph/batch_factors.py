@@ -46,6 +46,8 @@ class BatchMotions:
         self._motions = np.array([m.motion for m in self._all]).reshape(-1, 3)
         self._of_wheels = np.array([m.source == "wheels" for m in self._all], dtype=bool)
         self._W = whitenings([m.cov for m in self._all]) if held else np.zeros((0, 3, 3))
+        back = np.array([se2.adjoint(se2.inverse(m)) for m in self._motions]).reshape(-1, 3, 3)
+        self._by_first = -self._W @ back  # by the pose before
         self._H, self._r = np.zeros((len(held), 3, self._n)), np.zeros((len(held), 3))
         self._installed = [any(name in installation.index for name in m.depends_on) for m in self._all]
         for i, m in enumerate(self._all):
@@ -96,10 +98,9 @@ class BatchMotions:
             values = gtsam.Values(constants)
             values.insert(first, gtsam.Pose2(*before[i]))
             values.insert(second, gtsam.Pose2(*after[i]))
-            W, H = self._W[i], self._H[i]
-            A = -W @ se2.adjoint(se2.inverse(m.motion))
             noise = gtsam.noiseModel.Isotropic.Sigma(3, math.sqrt(scales[i]))
-            linear = gtsam.JacobianFactor(first, A, second, W, INSTALLATION, H, -self._r[i], noise)
+            blocks = first, self._by_first[i], second, self._W[i], INSTALLATION, self._H[i]
+            linear = gtsam.JacobianFactor(*blocks, -self._r[i], noise)
             yield gtsam.LinearContainerFactor(linear, values)
 
 

@@ -588,7 +588,7 @@ class Observations:
                 used = stack.columns[i] >= 0
                 d = batch.rows[i]
                 H, J = stack.H[i, :d], stack.J[i, :d]
-                shared = batch.shared(i, stack)[:d]
+                shared = batch.shared(i, stack)
                 found[row] = Linearized(
                     stack.residual[i, :d], J, stack.columns[i][used], H[:, used], shared, bool(stack.behind[i])
                 )
