@@ -421,10 +421,11 @@ def unread_map(recording: Recording, config: Config) -> str | None:
 def _unused(recording: Recording, config: Config) -> list[str]:
     """Sentences on topics that hold the robot's position, and that nothing reads, or nothing as it is configured."""
     lacking, found = _lacking(config), []
-    optional = {
+    placed = bool(placing_roles(recording.roles, config))
+    optional = {  # what could see landmarks too: told where nothing else does
         kind: sensor
         for sensor in outside_sensors()
-        if sensor.name in lacking and getattr(sensor, "optional", False)
+        if not placed and sensor.name in lacking and getattr(sensor, "optional", False)
         for stream in sensor.streams
         for kind in stream.converters
     }

@@ -204,6 +204,19 @@ def test_two_receivers_of_a_sensor_are_a_choice_not_unread(tmp_path):
     assert [note for note in info.notes if "recording.topics.gnss" in note and "/rear" in note]
 
 
+@pytest.mark.parametrize("sightings", [True, False])
+def test_a_laser_scan_is_offered_for_reflectors_only_where_nothing_else_sees_landmarks(tmp_path, sightings):
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(20):
+            stamp = START_NS + k * TICK_NS
+            bag.odometry("/odom", stamp, (0.05 * k, 0, 0), (1, 0), covs=(np.eye(6), np.eye(6)))
+            bag.laser_scan("/scan", stamp, np.ones(8), np.ones(8), (-1.0, 1.0))
+            if sightings:
+                bag.range_bearing("/seen", stamp, [(7, 2.0, 0.0)])
+    offered = [line for line in inspect(tmp_path / "run", CONFIG).findings if "reflectors.min_intensity" in line]
+    assert bool(offered) != sightings
+
+
 def test_ambiguity_and_damage_do_not_stop_the_report(tmp_path):
     folder = write_drive(tmp_path / "run", n=50)
     config = Config.model_validate({"recording": {"topics": {"odometry": "/odm"}}})
