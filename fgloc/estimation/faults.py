@@ -17,7 +17,7 @@ from fgloc.graph.estimators import Estimator
 from fgloc.graph.joint import MOST_JOINT
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.graph.noise import COVARIANCE_FACTOR, NoiseBudget
-from fgloc.graph.observation import Linearized
+from fgloc.graph.observation import Lines
 from fgloc.sensors.wheels.motion import commanded_to_move, is_standing
 from fgloc.stats import GATE, alarm_bound, chi2_bound
 from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings, Step
@@ -296,7 +296,7 @@ class InnovationBias:
         """Forget all innovations, as the pose was set anew."""
         self._windows.clear()
 
-    def is_biased(self, key: Hashable, stamp_ns: int, one: Linearized, pose_cov: FloatArray) -> bool:
+    def is_biased(self, key: Hashable, stamp_ns: int, one: Lines, pose_cov: FloatArray) -> bool:
         """Add an innovation that passed the gate; whether the newest ones together do not.
 
         Their own noise is white. What is not known of the pose is taken to be the same in all of them.
@@ -304,7 +304,7 @@ class InnovationBias:
         Args:
             key: `LandmarkMeasurement.bias_key`.
             stamp_ns: of the measurement; asked again of the same one, it counts once.
-            one: the measurement at the predicted pose.
+            one: the measurement alone, at the predicted pose.
             pose_cov: ``(3, 3)`` of the prediction.
         """
         held = self._windows.setdefault(key, _Window())
@@ -316,7 +316,7 @@ class InnovationBias:
                 column.pop()
         held.stamps_ns.append(stamp_ns)
         held.innovations.append(one.residual)
-        held.prediction.append(np.hstack([one.J @ np.linalg.cholesky(pose_cov), one.shared]))
+        held.prediction.append(np.hstack([one.H[:, :3] @ np.linalg.cholesky(pose_cov), one.shared]))
         if len(held.stamps_ns) < 2 or len({part.shape for part in held.prediction}) > 1:
             return False
         total, common = np.sum(held.innovations, axis=0), np.sum(held.prediction, axis=0)

@@ -25,7 +25,7 @@ from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
-from fgloc.graph.observation import Linearized, Observations
+from fgloc.graph.observation import Observations
 from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import chi2_bound, evidence_bound
 from fgloc.types import FloatArray, MotionMeasurement
@@ -40,31 +40,43 @@ Explained = tuple[FloatArray, FloatArray, FloatArray]
 
 def explain(w: FloatArray, G: FloatArray, mean: FloatArray, cov: FloatArray) -> Explained:
     """A white innovation ``(d,)`` whose mean is ``G δ`` under each hypothesis, and δ after it."""
-    gap = w - np.einsum("ldi,li->ld", G, mean)
-    information, pull = G.transpose(0, 2, 1) @ G, np.einsum("ldi,ld->li", G, gap)
-    after = np.linalg.inv(np.linalg.inv(cov) + information)
+    gap = w - (G @ mean[:, :, None])[:, :, 0]
+    Gt = G.transpose(0, 2, 1)
+    pull = Gt @ gap[:, :, None]
+    weight = cov @ (Gt @ G)  # I + it: how much less the prior weighs
+    weight[:, 0, 0] += 1.0
+    weight[:, 1, 1] += 1.0
+    adjugate = np.empty_like(weight)
+    adjugate[:, 0, 0], adjugate[:, 1, 1] = weight[:, 1, 1], weight[:, 0, 0]
+    adjugate[:, 0, 1], adjugate[:, 1, 0] = -weight[:, 0, 1], -weight[:, 1, 0]
+    determinant = weight[:, 0, 0] * weight[:, 1, 1] - weight[:, 0, 1] * weight[:, 1, 0]
+    after = (adjugate @ cov) / determinant[:, None, None]
     after = 0.5 * (after + after.transpose(0, 2, 1))
-    step = np.einsum("lij,lj->li", after, pull)
-    cost = (gap**2).sum(1) - (pull * step).sum(1) + np.linalg.slogdet(np.eye(2) + cov @ information)[1]
-    return cost, mean + step, after
+    step = after @ pull
+    cost = (gap * gap).sum(1) - (pull * step).sum((1, 2)) + np.log(determinant)
+    return cost, mean + step[:, :, 0], after
 
 
-def by_displacement(one: Linearized, pose: FloatArray) -> FloatArray:
-    """Derivative ``(d, 2)`` of a sighting's residual by its landmark's displacement in the map."""
+def by_displacement(J: FloatArray, pose: FloatArray) -> FloatArray:
+    """Derivative ``(d, 2)`` of a sighting's residual by its landmark's displacement in the map.
+
+    Args:
+        J: ``(d, 3)`` by the right perturbation of the pose.
+        pose: ``(3,)``.
+    """
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.asarray(-one.J[:, :2] @ np.array([[c, s], [-s, c]]))
+    return np.asarray(-J[:, :2] @ np.array([[c, s], [-s, c]]))
 
 
-def rotation_cov(one: Linearized, rows: tuple[int, int]) -> FloatArray:
+def rotation_cov(H: FloatArray, rows: tuple[int, int]) -> FloatArray:
     """Covariance ``(d, d)`` of a marker's residual if whoever moved it also turned it, and hung it higher or lower.
 
     Args:
-        one: the sighting.
+        H: ``(d, 3 + n)`` by pose and installation.
         rows: first and number of the rows of its landmark in the installation.
     """
-    of_it = (one.columns >= rows[0] + 2) & (one.columns < rows[0] + rows[1])
-    H = one.H[:, of_it] * MOVED
-    return np.asarray(H @ H.T)
+    by_marker = H[:, 3 + rows[0] + 2 : 3 + rows[0] + rows[1]] * MOVED
+    return np.asarray(by_marker @ by_marker.T)
 
 
 # --- The hypotheses ---------------------------------------------------------------------------------------------------
@@ -233,18 +245,16 @@ class LandmarkModes:
     ) -> None:
         """Add the evidence of fused sightings, linear about the belief after them, and update M."""
         known, theta = self._known(predicted), self._known(belief).mean
-        lines = self._factors.observe(seen).linearize(belief.pose, theta)
-        if any(one.behind for one in lines):
+        lines = self._factors.observe(seen).together(belief.pose, theta)
+        if lines.behind.any():
             return
         P = joint_cov(predicted, known)
         found = innovation(P, lines)
         there = np.concatenate([se2.log(se2.between(predicted.pose, belief.pose)), theta - known.mean])
-        G, parts, row = -(found.H @ self._M), [], 0
-        for m, one in zip(seen, lines, strict=True):
-            parts.append(slice(row, row + len(one.residual)))
+        G, parts, own = -(found.H @ self._M), lines.parts, by_displacement(found.H, belief.pose)
+        for m, part in zip(seen, parts, strict=True):
             if m.of_landmark:
-                G[self._rows[m.landmark_id], parts[-1]] -= by_displacement(one, belief.pose)
-            row = parts[-1].stop
+                G[self._rows[m.landmark_id], part] -= own[part]
         W = sighting_whitening(found.cov)  # lower triangular: each sighting given those before it
         w, G = W @ (found.residual - found.H @ there), W @ G
         for m, part in zip(seen, parts, strict=True):
@@ -255,10 +265,10 @@ class LandmarkModes:
     def _contradicted(self, P: FloatArray, belief: PoseWithCovariance, m: LandmarkMeasurement) -> None:
         """A sighting that was rejected; how its own landmark's displacement explains it may be far from linear."""
         own, observed, scale = self._rows[m.landmark_id], self._factors.observe([m]), self._shared(m)
-        one = observed.linearize(belief.pose, self._known(belief).mean)[0]
-        if one.behind:
+        one = observed.together(belief.pose, self._known(belief).mean)
+        if one.behind.any():
             return
-        found = innovation(P, [one])
+        found = innovation(P, one)
         W = sighting_whitening(found.cov) / scale
         misread = chi2_bound(self._gate, len(one.residual)) / scale**2
         explained = self._explain_own(own, P, belief, observed, scale)
@@ -273,11 +283,11 @@ class LandmarkModes:
         theta, costs = self._known(belief).mean, []
         for moved in (np.zeros(2), by):
             x, y = belief.pose[:2] - moved  # moving the landmark one way is moving the robot the other
-            one = observed.linearize(np.array([x, y, belief.pose[2]]), theta)[0]
-            if one.behind:
+            one = observed.together(np.array([x, y, belief.pose[2]]), theta)
+            if one.behind.any():
                 return
             misread = chi2_bound(self._gate, len(one.residual))
-            found = innovation(P, [one])
+            found = innovation(P, one)
             w = sighting_whitening(found.cov) @ found.residual
             costs.append(min(float(w @ w), misread) / scale**2)
         evidence = max(self._returned.get(m.landmark_id, 0.0) + costs[1] - costs[0], 0.0)
@@ -294,11 +304,11 @@ class LandmarkModes:
         explained = np.array([np.inf]), self._moved[row, None], self._cov[row, None]
         for _ in range(MOST_STEPS):
             x, y = belief.pose[:2] - moved  # moving the landmark one way is moving the robot the other
-            one = observed.linearize(np.array([x, y, belief.pose[2]]), theta)[0]
-            if one.behind:
+            one = observed.together(np.array([x, y, belief.pose[2]]), theta)
+            if one.behind.any():
                 break
-            found, B = innovation(P, [one]), by_displacement(one, belief.pose)
-            W = sighting_whitening(found.cov + rotation_cov(one, rows)) / scale
+            found, B = innovation(P, one), by_displacement(one.H, belief.pose)
+            W = sighting_whitening(found.cov + rotation_cov(one.H, rows)) / scale
             G = -W @ (B + found.H @ self._M[row])
             w = W @ (found.residual - B @ moved)
             explained = explain(w, G[None], self._moved[row, None], self._cov[row, None])

@@ -136,8 +136,8 @@ class Association:
     def _is_biased(self, m: LandmarkMeasurement, predicted: PoseWithCovariance) -> bool:
         if m.bias_key is None:
             return False
-        (one,) = self._factors.observe([m]).linearize(predicted.pose, self._factors.estimated.mean)
-        return self._bias.is_biased(m.bias_key, m.stamp_ns, one, predicted.cov)
+        lines = self._factors.linearize([m], predicted.pose)
+        return self._bias.is_biased(m.bias_key, m.stamp_ns, lines, predicted.cov)
 
     def _explained_otherwise(
         self, m: LandmarkMeasurement, verdict: tuple[float, int, str], predicted: PoseWithCovariance
@@ -235,9 +235,8 @@ class Association:
         found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
         uncertain = not is_linear(predicted)
         judged = []
-        for m, one, nis in zip(measurements, lines, found, strict=True):
-            dof = len(one.residual)
-            if one.behind:
+        for m, dof, behind, nis in zip(measurements, lines.dofs, lines.behind, found, strict=True):
+            if behind:
                 judged.append((math.nan, dof, "behind_camera"))
                 continue
             bound = self._gate(dof)
@@ -310,11 +309,11 @@ class Association:
         if corrected is None or corrected[0].installation is None:
             return math.inf, []
         belief, theirs = corrected[0], corrected[0].installation
-        lines = self._factors.observe([measurements[i] for i in others]).linearize(belief.pose, theirs.mean)
+        lines = self._factors.observe([measurements[i] for i in others]).together(belief.pose, theirs.mean)
         found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
         ratios = {
-            i: math.inf if one.behind else nis / self._gate(len(one.residual))
-            for i, one, nis in zip(others, lines, found, strict=True)
+            i: math.inf if behind else nis / self._gate(dof)
+            for i, dof, behind, nis in zip(others, lines.dofs, lines.behind, found, strict=True)
         }
         return corrected[1], sorted((i for i in others if ratios[i] <= 1.0), key=lambda i: ratios[i])
 

@@ -28,7 +28,7 @@ from fgloc.estimation.beacons import CARRIED, WRONG_LANDMARK, Track
 from fgloc.estimation.pose_fit import MAX_SIGMA, apart
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov
+from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.sensors.measurements import PointMeasurement
 from fgloc.stats import chi2_bound
@@ -153,11 +153,10 @@ class Naming:
             spans.append(slice(len(as_if), len(as_if) + len(near)))
             as_if += [replace(m, landmark_id=i) for i in near]
         P = joint_cov(belief, known)
-        lines = self._factors.observe(as_if).linearize(belief.pose, known.mean) if as_if else []
-        nis = []
-        for one in lines:
-            gap = innovation(P, [one])
-            nis.append(float(gap.residual @ np.linalg.solve(gap.cov, gap.residual)))
+        nis: list[float] = []
+        if as_if:
+            lines = self._factors.observe(as_if).together(belief.pose, known.mean)
+            nis = nis_of_each(innovation(P, lines), lines)
         ranked = [sorted(zip(nis[s], as_if[s], strict=True), key=lambda e: e[0]) if s else None for s in spans]
         return [None if own is None else {m.landmark_id: (n, m) for n, m in own} for own in ranked]
 

@@ -26,7 +26,7 @@ from fgloc.graph.ground import gravity, gravity_factor, ground_prior, step_facto
 from fgloc.graph.installation import GROUND, Installation
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
 from fgloc.graph.noise import whitening_of
-from fgloc.graph.observation import Linearized, Observations, Stacked
+from fgloc.graph.observation import Linearized, Lines, Observations, Stacked
 from fgloc.types import FloatArray, IntArray
 
 _WHEELS_CAUCHY_K = 3.0  # sigmas, as of sightings in fits of a pose
@@ -228,7 +228,7 @@ class _Images:
                 some = self._of_keyframe(sightings, own[start], there)
             ahead = [i for i, one in enumerate(some) if not one.behind]
             if ahead:
-                kept = [sightings[i] for i in ahead], [some[i] for i in ahead]
+                kept = [sightings[i] for i in ahead], Lines.of([some[i] for i in ahead], len(there))
                 yield from sighting_factors(int(self._k[start]), *kept, own[start], there, constants)
 
     def _of_keyframe(

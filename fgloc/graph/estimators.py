@@ -664,11 +664,11 @@ class IncrementalEstimator(Estimator):
             if known is self.factors.estimated:
                 lines = self.factors.linearize(measurements, initial.pose)
             else:
-                lines = self.factors.observe(measurements).linearize(initial.pose, known.mean)
-            kept = [(s, one) for s, one in zip(frame.sightings, lines, strict=True) if not one.behind]
-            if kept:
-                sightings, ahead = zip(*kept, strict=True)
-                made += sighting_factors(frame.k, sightings, ahead, initial.pose, known.mean, constants)
+                lines = self.factors.observe(measurements).together(initial.pose, known.mean)
+            ahead = np.flatnonzero(~lines.behind).tolist()
+            if ahead:
+                sightings, lines = [frame.sightings[i] for i in ahead], lines.only(ahead)
+                made += sighting_factors(frame.k, sightings, lines, initial.pose, known.mean, constants)
         for sighting in frame.sightings:
             self._introduce(sighting.measurement, initial.pose, values)
             made += sighting.factors

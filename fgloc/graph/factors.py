@@ -21,7 +21,7 @@ from fgloc.frames import rotations
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
-from fgloc.graph.observation import Linearized, Observations, stacked
+from fgloc.graph.observation import Linearized, Lines, Observations
 from fgloc.sensors.measurements import FrameMeasurement, LandmarkMeasurement, PointMeasurement
 from fgloc.types import (
     FloatArray,
@@ -141,7 +141,7 @@ def installed_prior_factor(
 def sighting_factors(
     k: int,
     sightings: Sequence[LandmarkFactor],
-    lines: Sequence[Linearized],
+    lines: Lines,
     pose: FloatArray,
     theta: FloatArray,
     constants: int | None = None,
@@ -165,10 +165,11 @@ def sighting_factors(
         images.setdefault(sighting.measurement.stamp_ns, []).append(i)
     made = []
     for members in images.values():
-        r, J, H, cov = stacked([lines[i] for i in members], len(theta))
-        W = sighting_whitening(cov)
-        blocks = {pose_key(k): W @ J} | installation_blocks(k, W @ H, shared)
-        made.append(linear_factor(blocks, W @ r, values))
+        image = lines.only(members)
+        W = sighting_whitening(image.noise())
+        A = W @ image.H
+        blocks = {pose_key(k): A[:, :3]} | installation_blocks(k, A[:, 3:], shared)
+        made.append(linear_factor(blocks, W @ image.residual, values))
     return made
 
 
@@ -204,6 +205,9 @@ _OF_VARIABLE: Mapping[int, Callable[[int, Any, float | None], gtsam.NonlinearFac
 """Factor of a sighting by `LandmarkMeasurement.variable_dof`."""
 
 
+_NOTHING: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, int]], Lines] = np.zeros(3), {}, Lines.of((), 0)
+
+
 class LandmarkFactors:
     """Residuals of sightings: of a known map as residuals by pose and installation, of an unknown one as factors.
 
@@ -216,7 +220,7 @@ class LandmarkFactors:
         self.installation = Installation({}) if installation is None else installation
         self._estimated = self.installation.prior()
         self._prepared: tuple[tuple[LandmarkMeasurement, ...], Observations | None] = (), None
-        self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, Linearized]]] = (np.zeros(3), {})
+        self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, int]], Lines] = _NOTHING
 
     def with_installation(self, installation: Installation) -> LandmarkFactors:
         """Copy with another installation; parameters with a smaller prior sigma than before start from its mean."""
@@ -237,7 +241,7 @@ class LandmarkFactors:
     @estimated.setter
     def estimated(self, belief: InstallationEstimate) -> None:
         self._estimated = belief
-        self._remembered = np.zeros(3), {}
+        self._remembered = _NOTHING
 
     def time_offset_s(self, camera: str = "") -> float:
         """How late stamps of sightings are, as far as is known; of several cameras those of one."""
@@ -282,17 +286,17 @@ class LandmarkFactors:
             self._prepared = held, observed
         return observed
 
-    def linearize(self, measurements: Sequence[LandmarkMeasurement], pose: FloatArray) -> list[Linearized]:
-        """Each sighting at a pose and the installation as it is known now.
+    def linearize(self, measurements: Sequence[LandmarkMeasurement], pose: FloatArray) -> Lines:
+        """Sightings at a pose and the installation as it is known now.
 
         Asked again of some of the same sightings at the same pose, as a step does, the answer is remembered.
         """
-        at, held = self._remembered
-        if at is pose and all(id(m) in held for m in measurements):
-            return [held[id(m)][1] for m in measurements]
-        lines = self.observe(measurements).linearize(pose, self.estimated.mean)
-        self._remembered = pose, {id(m): (m, one) for m, one in zip(measurements, lines, strict=True)}
-        return lines
+        at, held, lines = self._remembered
+        if at is not pose or any(id(m) not in held for m in measurements):
+            lines = self.observe(measurements).together(pose, self.estimated.mean)
+            held = {id(m): (m, i) for i, m in enumerate(measurements)}
+            self._remembered = pose, held, lines
+        return lines.only([held[id(m)][1] for m in measurements])
 
     def whitening(self, one: Linearized) -> FloatArray:
         """``(d, d)`` that makes the residual white, installation included as if it were noise."""

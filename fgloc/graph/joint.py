@@ -18,7 +18,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import sighting_whitening
-from fgloc.graph.observation import Linearized, stacked
+from fgloc.graph.observation import Lines
 from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import ROUNDING
 from fgloc.types import FloatArray, MotionMeasurement
@@ -101,13 +101,11 @@ class Innovation:
     Attributes:
         residual: ``(d,)`` predicted minus measured.
         H: ``(d, 3 + n)`` by pose and installation.
-        noise: ``(d, d)`` of the sightings alone.
         cov: ``(d, d)`` of the residual.
     """
 
     residual: FloatArray
     H: FloatArray
-    noise: FloatArray
     cov: FloatArray
 
 
@@ -121,21 +119,25 @@ def joint_cov(belief: PoseWithCovariance, known: InstallationEstimate) -> FloatA
     return P
 
 
-def innovation(P: FloatArray, lines: Sequence[Linearized]) -> Innovation:
+def innovation(P: FloatArray, lines: Lines) -> Innovation:
     """The innovation of sightings, linearized at the belief whose joint covariance ``P`` is."""
-    residual, J, H, noise = stacked(lines, len(P) - se2.DOF)
-    both = np.hstack([J, H])
-    return Innovation(residual, both, noise, both @ P @ both.T + noise)
+    return Innovation(lines.residual, lines.H, lines.H @ P @ lines.H.T + lines.noise())
 
 
-def nis_of_each(found: Innovation, lines: Sequence[Linearized]) -> list[float]:
+def nis_of_each(found: Innovation, lines: Lines) -> list[float]:
     """Squared Mahalanobis distance of each sighting by itself."""
-    out, row = [], 0
-    for one in lines:
-        part = slice(row, row + len(one.residual))
-        out.append(float(np.sum((sighting_whitening(found.cov[part, part]) @ found.residual[part]) ** 2)))
-        row += len(one.residual)
-    return out
+    m, d = len(lines), max(lines.dofs, default=0)
+    if m * d == len(found.residual):  # all of one size: in one call
+        each = np.arange(m)
+        covs, r = found.cov.reshape(m, d, m, d)[each, :, each], found.residual.reshape(m, d)
+        try:
+            white = np.linalg.solve(np.linalg.cholesky(covs), r[:, :, None])
+            return [float(nis) for nis in (white**2).sum(axis=(1, 2))]
+        except np.linalg.LinAlgError:  # next to the image plane: one by one, without its tiny values
+            pass
+    return [
+        float(np.sum((sighting_whitening(found.cov[part, part]) @ found.residual[part]) ** 2)) for part in lines.parts
+    ]
 
 
 def correct(
@@ -156,8 +158,8 @@ def correct(
     x = np.zeros(3 + n)  # tangent of the belief
     pose, theta = belief.pose, known.mean
     for _ in range(MOST_STEPS):
-        lines = observed.linearize(pose, theta)
-        if any(one.behind for one in lines):
+        lines = observed.together(pose, theta)
+        if lines.behind.any():
             return None
         found = innovation(P, lines)
         try:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from fgloc import se2
 from fgloc.errors import CovarianceError
@@ -62,7 +63,7 @@ def whitening_of(cov: FloatArray) -> FloatArray:
     try:
         if not np.isfinite(cov).all():
             raise np.linalg.LinAlgError("not finite")
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+        return _inverse_root(cov)
     except np.linalg.LinAlgError as error:
         raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: {error}") from error
 
@@ -78,10 +79,18 @@ def sighting_whitening(cov: FloatArray) -> FloatArray:
     if not np.isfinite(cov).all():
         raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: not finite")
     try:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+        return _inverse_root(cov)
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(cov)
         return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))).T)
+
+
+def _inverse_root(cov: FloatArray) -> FloatArray:
+    """Lower triangular W with ``Wᵀ W`` the inverse of a covariance; raises ``LinAlgError`` if it is none."""
+    root, failed = dpotrf(cov, lower=1, clean=1)
+    if failed:
+        raise np.linalg.LinAlgError("not positive definite")
+    return np.asarray(dtrtri(root, lower=1)[0])
 
 
 def covariance_problem(cov: FloatArray) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -104,19 +105,59 @@ def landmark_block(installation: Installation, landmark_id: int, rows: int) -> i
     return first if count >= rows else -1
 
 
-def stacked(lines: Sequence[Linearized], n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Residual ``(d,)``, Jacobians ``(d, 3)`` and ``(d, n)``, noise covariance ``(d, d)`` of sightings of one image."""
-    r = np.concatenate([one.residual for one in lines])
-    J = np.vstack([one.J for one in lines])
-    H = np.zeros((len(r), n))
-    row, most = 0, max(one.shared.shape[1] for one in lines)
-    shared = np.zeros((len(r), most))
-    for one in lines:
-        d = len(one.residual)
-        H[row : row + d, one.columns] = one.H
-        shared[row : row + d, : one.shared.shape[1]] = one.shared
-        row += d
-    return r, J, H, np.eye(len(r)) + shared @ shared.T
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """Sightings of one keyframe, linearized together: rows of all of them below each other.
+
+    Attributes:
+        residual: ``(d,)`` predicted minus measured, in units of each sighting's own noise.
+        H: ``(d, 3 + n)`` by the right perturbation of the pose and by the installation.
+        shared: ``(d, s)`` see `Linearized`; of sightings of one image the columns mean the same.
+        dofs: number of rows of each sighting.
+        behind: ``(m,)`` whether a corner is behind the camera; the rows of that one then mean nothing.
+    """
+
+    residual: FloatArray
+    H: FloatArray
+    shared: FloatArray
+    dofs: Sequence[int]
+    behind: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.dofs)
+
+    @property
+    def parts(self) -> list[slice]:
+        """Rows of each sighting."""
+        ends = list(accumulate(self.dofs))
+        return [slice(end - d, end) for d, end in zip(self.dofs, ends, strict=True)]
+
+    def noise(self) -> FloatArray:
+        """Covariance ``(d, d)`` of the residual without pose and installation."""
+        return np.asarray(np.eye(len(self.residual)) + self.shared @ self.shared.T)
+
+    def only(self, members: Sequence[int]) -> Lines:
+        """Those of some sightings, in this order."""
+        if len(members) == len(self) and all(i == j for i, j in enumerate(members)):
+            return self
+        parts = self.parts
+        rows = np.concatenate([np.arange(parts[i].start, parts[i].stop) for i in members])
+        dofs = [self.dofs[i] for i in members]
+        return Lines(self.residual[rows], self.H[rows], self.shared[rows], dofs, self.behind[list(members)])
+
+    @classmethod
+    def of(cls, each: Sequence[Linearized], n: int) -> Lines:
+        """Sightings that were linearized one by one; ``n`` parameters has the installation."""
+        dofs = [len(one.residual) for one in each]
+        r = np.concatenate([one.residual for one in each]) if each else np.zeros(0)
+        H = np.zeros((len(r), 3 + n))
+        shared = np.zeros((len(r), max((one.shared.shape[1] for one in each), default=0)))
+        found = cls(r, H, shared, dofs, np.array([one.behind for one in each], dtype=np.bool_))
+        for part, one in zip(found.parts, each, strict=True):
+            H[part, :3] = one.J
+            H[part, 3 + one.columns] = one.H
+            shared[part, : one.shared.shape[1]] = one.shared
+        return found
 
 
 # --- Corners of markers in images -------------------------------------------------------------------------------------
@@ -577,6 +618,22 @@ class Observations:
             found[members] = np.where(stack.behind, np.inf, (stack.residual**2).sum(axis=1))
             rows[members] = batch.rows
         return found, rows
+
+    def together(self, pose: FloatArray, theta: FloatArray) -> Lines:
+        """All sightings at a pose ``(3,)`` and an installation ``(n,)``, as one system of rows."""
+        if len(self.batches) == 1:
+            batch = self.batches[0][1]
+            stack = batch.evaluate(np.broadcast_to(pose, (self._count, 3)), theta)
+            m, d = stack.residual.shape
+            shared = batch.shared_all(stack)
+            if shared is not None and min(batch.rows) == d:
+                H = np.zeros((m, d, 4 + len(theta)))  # the last column takes what is no state
+                H[:, :, :3] = stack.J
+                columns = np.where(stack.columns < 0, len(theta), stack.columns) + 3
+                H[np.arange(m)[:, None, None], np.arange(d)[:, None], columns[:, None]] = stack.H
+                rows = H.reshape(m * d, -1)[:, :-1]
+                return Lines(stack.residual.ravel(), rows, shared.reshape(m * d, -1), batch.rows, stack.behind)
+        return Lines.of(self.linearize(pose, theta), len(theta))
 
     def linearize(self, poses: FloatArray, theta: FloatArray) -> list[Linearized]:
         """Every sighting at a pose ``(3,)``, or each at its own ``(m, 3)``, and an installation ``(n,)``."""

@@ -17,7 +17,7 @@ from fgloc.estimation.faults import GlrTest, InnovationBias, LiftMonitor
 from fgloc.estimation.localizer import Localizer
 from fgloc.estimation.pose_fit import Fit, PoseConsensus
 from fgloc.graph.noise import FusionRules, NoiseBudget
-from fgloc.graph.observation import Linearized
+from fgloc.graph.observation import Lines
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.types import Mode, MotionMeasurement, MotionReadings, Step
 
@@ -151,6 +151,6 @@ def test_a_floor_that_shakes_turns_no_robot(turn, told):
 @pytest.mark.parametrize(("sigma", "biased"), [(1e-3, True), (2.0, False)])
 def test_a_bias_that_the_pose_explains_is_none(sigma, biased):
     bias = InnovationBias(0.999, 10.0)
-    one = Linearized(np.array([1.5, -1.5]), np.eye(2, 3), np.zeros(0, int), np.zeros((2, 0)), np.zeros((2, 0)))
+    one = Lines(np.array([1.5, -1.5]), np.eye(2, 3), np.zeros((2, 0)), [2], np.array([False]))
     told = [bias.is_biased("1", k * DT_NS, one, np.eye(3) * sigma**2) for k in range(1, 20)]
     assert any(told) == biased
