@@ -68,6 +68,23 @@ _DEFINITIONS = {
         "std_msgs/Header header\nuint32 id\ngeometry_msgs/PoseWithCovariance pose\nfloat64 confidence\n"
     ),
     "aruco_msgs/msg/MarkerArray": "std_msgs/Header header\naruco_msgs/Marker[] markers\n",
+    "apriltag_ros/msg/AprilTagDetection": (
+        "int32[] id\nfloat64[] size\ngeometry_msgs/PoseWithCovarianceStamped pose\n"
+    ),
+    "apriltag_ros/msg/AprilTagDetectionArray": (
+        "std_msgs/Header header\napriltag_ros/AprilTagDetection[] detections\n"
+    ),
+    "ar_track_alvar_msgs/msg/AlvarMarker": (
+        "std_msgs/Header header\nuint32 id\nuint32 confidence\ngeometry_msgs/PoseStamped pose\n"
+    ),
+    "ar_track_alvar_msgs/msg/AlvarMarkers": ("std_msgs/Header header\nar_track_alvar_msgs/AlvarMarker[] markers\n"),
+    "isaac_ros_apriltag_interfaces/msg/AprilTagDetection": (
+        "string family\nint32 id\ngeometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n"
+        "geometry_msgs/PoseWithCovarianceStamped pose\n"
+    ),
+    "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": (
+        "std_msgs/Header header\nisaac_ros_apriltag_interfaces/AprilTagDetection[] detections\n"
+    ),
     "ackermann_msgs/msg/AckermannDrive": (
         "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\nfloat32 acceleration\nfloat32 jerk\n"
     ),

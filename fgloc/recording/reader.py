@@ -95,18 +95,24 @@ def _covariance_truth(m: Any, when: When) -> Event:
     return TruthEvent(*when, m.header.frame_id, xyz(m.pose.pose.position), xyzw(m.pose.pose.orientation))
 
 
+def _transform_truth(m: Any, when: When) -> Event:
+    return TruthEvent(*when, m.header.frame_id, xyz(m.transform.translation), xyzw(m.transform.rotation))
+
+
 def _planar_truth(m: Any, when: When) -> Event:
     half = 0.5 * float(m.theta)
     orientation = np.array([0.0, 0.0, math.sin(half), math.cos(half)]) if math.isfinite(half) else np.full(4, math.nan)
     return TruthEvent(*when, "", np.array([m.x, m.y, 0.0]), orientation)
 
 
+_TRANSFORM = "geometry_msgs/msg/TransformStamped"  # as Vicon's bridge publishes poses
 CONVERTERS: dict[Role, dict[str, Converter]] = {
     "camera_info": {"sensor_msgs/msg/CameraInfo": _camera_info},
     "truth": {
         "geometry_msgs/msg/PoseStamped": _pose_truth,
         "geometry_msgs/msg/PoseWithCovarianceStamped": _covariance_truth,
         "geometry_msgs/msg/Pose2D": _planar_truth,
+        _TRANSFORM: _transform_truth,
         "nav_msgs/msg/Odometry": _covariance_truth,
     },
 }
@@ -170,7 +176,9 @@ def select_roles(
     for role in sorted(names, key=_by_dependence):
         if config.given(role) is not None:
             continue
-        candidates = [topic.name for topic in filled if _fits(role, topic) and topic.name not in roles.values()]
+        fitting = [topic for topic in filled if _fits(role, topic) and topic.name not in roles.values()]
+        poses = [topic.name for topic in fitting if topic.message_type != _TRANSFORM]
+        candidates = poses or [topic.name for topic in fitting]
         camera = role.rpartition("/")[0]
         near = roles.get(camera_role(camera, "image")) or roles.get(camera_role(camera, "sightings"))
         if role in config.of_cameras:  # a calibration that is not beside its images may be of any camera
@@ -285,8 +293,8 @@ def _fits(role: Role, topic: TopicInfo) -> bool:
     if topic.message_type not in converters_of(role):
         return False
     if role == "truth":
-        odometry = topic.message_type in converters_of("odometry")
-        return _says_truth(topic.name) or not (odometry or _NOT_TRUTH.search(topic.name))
+        other = topic.message_type == _TRANSFORM or topic.message_type in converters_of("odometry")
+        return _says_truth(topic.name) or not (other or _NOT_TRUTH.search(topic.name))
     if role == "odometry":
         return not _says_truth(topic.name)
     if role in ("image", "camera_info"):

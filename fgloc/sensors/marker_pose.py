@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -96,6 +96,36 @@ def from_fiducial_transforms(m: Any, when: When) -> Event:
     return MarkerPosesEvent(*when, m.header.frame_id, tuple(seen))
 
 
+def from_apriltag_ros(m: Any, when: When) -> Event:
+    """Event of a ``apriltag_ros/AprilTagDetectionArray`` (ROS 1); bundles of tags have no number, and are left out."""
+    seen = tuple(_marker_pose(int(d.id[0]), d.pose.pose) for d in m.detections if len(d.id) == 1)
+    return MarkerPosesEvent(*when, m.header.frame_id or _frame(d.pose for d in m.detections), seen)
+
+
+def from_isaac(m: Any, when: When) -> Event:
+    """Event of a ``isaac_ros_apriltag_interfaces/AprilTagDetectionArray``, by its poses."""
+    seen = tuple(_marker_pose(int(d.id), d.pose.pose) for d in m.detections)
+    return MarkerPosesEvent(*when, m.header.frame_id or _frame(d.pose for d in m.detections), seen)
+
+
+def from_alvar(m: Any, when: When) -> Event:
+    """Event of a ``ar_track_alvar_msgs/AlvarMarkers``, whose poses are in the frame that each of them names.
+
+    Raises:
+        ValueError: they are in several frames.
+    """
+    seen = tuple(_bare_pose(int(marker.id), marker.pose.pose) for marker in m.markers)
+    frames = {_frame((marker, marker.pose)) for marker in m.markers} - {""}
+    if len(frames) > 1:
+        raise ValueError(f"poses in several frames: {', '.join(sorted(frames))}")
+    return MarkerPosesEvent(*when, next(iter(frames), m.header.frame_id), seen)
+
+
+def _frame(stamped: Iterable[Any]) -> str:
+    """The first frame that one of these messages names in its header."""
+    return next((frame for one in stamped if (frame := one.header.frame_id)), "")
+
+
 def _bare_pose(marker_id: int, pose: Any) -> MarkerPose:
     """Marker pose of a ``geometry_msgs/Pose``, which has no covariance."""
     return MarkerPose(marker_id, xyz(pose.position), xyzw(pose.orientation), np.zeros((6, 6)))
@@ -178,9 +208,12 @@ MARKER_POSE = BuiltIn(
             "sightings",
             MarkerPosesEvent,
             {
+                "apriltag_ros/msg/AprilTagDetectionArray": from_apriltag_ros,
+                "ar_track_alvar_msgs/msg/AlvarMarkers": from_alvar,
                 "aruco_msgs/msg/MarkerArray": from_aruco,
                 "aruco_opencv_msgs/msg/ArucoDetection": from_aruco_opencv,
                 "fiducial_msgs/msg/FiducialTransformArray": from_fiducial_transforms,
+                "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": from_isaac,
                 "ros2_aruco_interfaces/msg/ArucoMarkers": from_ros2_aruco,
                 "vision_msgs/msg/Detection3DArray": from_detections,
             },

@@ -232,9 +232,42 @@ def fiducial_transforms(bag, header):
     return bag.make("fiducial_msgs/msg/FiducialTransformArray", header=header, image_seq=0, transforms=seen)
 
 
+def stamped_pose(bag, header):
+    pose = make_pose(bag, 2.0)
+    return bag.make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=pose)
+
+
+def apriltag_ros(bag, header):
+    kind, pose = "apriltag_ros/msg/AprilTagDetection", stamped_pose(bag, header)
+    tags = [bag.make(kind, id=np.array(ids, np.int32), size=np.ones(len(ids)), pose=pose) for ids in ([7], [1, 2])]
+    return bag.make("apriltag_ros/msg/AprilTagDetectionArray", header=header, detections=tags)
+
+
+def isaac(bag, header):
+    point = bag.make("geometry_msgs/msg/Point", x=1.0, y=1.0, z=0.0)
+    values = dict(family="36h11", id=7, center=point, corners=[point] * 4, pose=stamped_pose(bag, header))
+    tag = bag.make("isaac_ros_apriltag_interfaces/msg/AprilTagDetection", **values)
+    return bag.make("isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", header=header, detections=[tag])
+
+
+def alvar(bag, header, *frames):
+    """The array's own header names no frame, as that of the older nodes."""
+    markers = []
+    for frame in frames or ("cam",):
+        own = bag.make("std_msgs/msg/Header", stamp=header.stamp, frame_id=frame)
+        nowhere = bag.make("std_msgs/msg/Header", stamp=header.stamp, frame_id="")
+        pose = bag.make("geometry_msgs/msg/PoseStamped", header=nowhere, pose=make_pose(bag, 2.0).pose)
+        markers.append(bag.make("ar_track_alvar_msgs/msg/AlvarMarker", header=own, id=7, confidence=1, pose=pose))
+    whole = bag.make("std_msgs/msg/Header", stamp=header.stamp, frame_id="")
+    return bag.make("ar_track_alvar_msgs/msg/AlvarMarkers", header=whole, markers=markers)
+
+
 @pytest.mark.parametrize(
     ("kind", "make"),
     [
+        ("apriltag_ros/msg/AprilTagDetectionArray", apriltag_ros),
+        ("ar_track_alvar_msgs/msg/AlvarMarkers", alvar),
+        ("isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray", isaac),
         ("aruco_opencv_msgs/msg/ArucoDetection", aruco_opencv),
         ("ros2_aruco_interfaces/msg/ArucoMarkers", ros2_aruco),
         ("fiducial_msgs/msg/FiducialTransformArray", fiducial_transforms),
@@ -246,6 +279,30 @@ def test_poses_of_other_detectors(tmp_path, kind, make):
     (seen,) = event.sightings
     assert (seen.landmark_id, *seen.position, *seen.orientation) == (7, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     assert not seen.cov.any()
+    assert event.frame_id == "cam"
+
+
+def test_poses_of_one_message_in_two_frames_are_undecodable(tmp_path):
+    kind = "ar_track_alvar_msgs/msg/AlvarMarkers"
+    folder = write_sightings(tmp_path / "run", kind, lambda bag, header: alvar(bag, header, "left", "right"))
+    with open_recording(folder, DEFAULT) as recording:
+        assert list(recording.events()) == []
+        assert recording.undecodable == {"/seen": 1}
+
+
+def test_truth_as_a_transform(tmp_path):
+    folder = tmp_path / "run"
+    with BagWriter(folder) as bag:
+        stamp = bag.make("builtin_interfaces/msg/Time", sec=5, nanosec=7)
+        header = bag.make("std_msgs/msg/Header", stamp=stamp, frame_id="world")
+        moved = bag.make("geometry_msgs/msg/Vector3", x=2.0, y=1.0, z=0.5)
+        turned = bag.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=1.0, w=0.0)
+        value = bag.make("geometry_msgs/msg/Transform", translation=moved, rotation=turned)
+        kind = "geometry_msgs/msg/TransformStamped"
+        bag.write("/vicon/robot/robot", kind, bag.make(kind, header=header, child_frame_id="robot", transform=value), 1)
+    (event,) = read(folder)
+    assert isinstance(event, TruthEvent)
+    assert (event.stamp_ns, *event.position, *event.orientation) == (5_000_000_007, 2.0, 1.0, 0.5, 0.0, 0.0, 1.0, 0.0)
 
 
 def test_of_ids_and_poses_that_differ_in_number_nothing_is_used(tmp_path):

@@ -12,6 +12,7 @@ from fgloc.errors import RecordingError
 from fgloc.recording.reader import TopicInfo, open_recording, select_roles
 
 ODOMETRY, TWIST, IMU = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist", "sensor_msgs/msg/Imu"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
 POSE, COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 TAGS, LANDMARKS = "apriltag_msgs/msg/AprilTagDetectionArray", "landmark_msgs/msg/LandmarkArray"
@@ -40,6 +41,9 @@ def select(*topics: tuple[str, str], empty: tuple[tuple[str, str], ...] = (), **
         ([("/move_base_simple/goal", POSE), ("/goal_pose", POSE), ("/initialpose", COVARIANCE)], {}),
         ([("/amcl_pose", COVARIANCE), ("/aruco_single/pose", POSE)], {}),
         ([("/vintage/pose", POSE)], {"truth": "/vintage/pose"}),
+        ([("/vicon/robot/robot", TRANSFORM)], {"truth": "/vicon/robot/robot"}),
+        ([("/vicon/robot/robot", TRANSFORM), ("/vicon/robot/pose", POSE)], {"truth": "/vicon/robot/pose"}),
+        ([("/gripper/transform", TRANSFORM)], {}),
         ([("/camera/image_raw", IMAGE), ("/camera/image_raw/compressed", COMPRESSED)], {"image": "/camera/image_raw"}),
         (
             [("/camera/depth/image_raw", IMAGE), ("/camera/color/image_raw", IMAGE)],
