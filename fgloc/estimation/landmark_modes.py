@@ -25,7 +25,7 @@ from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
-from fgloc.graph.observation import Observations
+from fgloc.graph.observation import Lines, Observations
 from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.stats import chi2_bound, evidence_bound
 from fgloc.types import FloatArray, MotionMeasurement
@@ -160,6 +160,7 @@ class LandmarkModes:
         belief: PoseWithCovariance,
         fused: Sequence[LandmarkFactor],
         rejected: Sequence[LandmarkFactor] = (),
+        lines: Lines | None = None,
     ) -> int | None:
         """Follow the estimator through one keyframe.
 
@@ -169,6 +170,7 @@ class LandmarkModes:
             belief: after them.
             fused: sightings that it took.
             rejected: sightings that it did not take.
+            lines: those that it took, linearized at the prediction; None: it is too uncertain for that.
 
         Returns:
             A landmark that is now known to be moved.
@@ -183,7 +185,7 @@ class LandmarkModes:
             A, D = transition(motions, self._factors.installation)
             self._M[:, :3] = A @ self._M[:, :3] + D @ self._M[:, 3:]
         if fused:
-            self._take(predicted, belief, [s.measurement for s in fused])
+            self._take(predicted, belief, [s.measurement for s in fused], lines)
             self._in_place.update(s.alone.landmark_id for s in seen)
             self._fused_ns = fused[0].measurement.stamp_ns
         P = joint_cov(belief, self._known(belief)) if against else np.zeros((0, 0))
@@ -241,17 +243,23 @@ class LandmarkModes:
         self._information[rows] = 0.0
 
     def _take(
-        self, predicted: PoseWithCovariance, belief: PoseWithCovariance, seen: Sequence[LandmarkMeasurement]
+        self,
+        predicted: PoseWithCovariance,
+        belief: PoseWithCovariance,
+        seen: Sequence[LandmarkMeasurement],
+        lines: Lines | None,
     ) -> None:
-        """Add the evidence of fused sightings, linear about the belief after them, and update M."""
+        """Add the evidence of fused sightings and update M; without lines they are linear about the belief."""
         known, theta = self._known(predicted), self._known(belief).mean
-        lines = self._factors.observe(seen).together(belief.pose, theta)
+        pose, there = predicted.pose, np.zeros(3 + len(theta))
+        if lines is None:
+            pose, lines = belief.pose, self._factors.observe(seen).together(belief.pose, theta)
+            there = np.concatenate([se2.log(se2.between(predicted.pose, belief.pose)), theta - known.mean])
         if lines.behind.any():
             return
         P = joint_cov(predicted, known)
         found = innovation(P, lines)
-        there = np.concatenate([se2.log(se2.between(predicted.pose, belief.pose)), theta - known.mean])
-        G, parts, own = -(found.H @ self._M), lines.parts, by_displacement(found.H, belief.pose)
+        G, parts, own = -(found.H @ self._M), lines.parts, by_displacement(found.H, pose)
         for m, part in zip(seen, parts, strict=True):
             if m.of_landmark:
                 G[self._rows[m.landmark_id], part] -= own[part]

@@ -29,6 +29,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition
+from fgloc.graph.observation import Lines
 from fgloc.sensors.measurements import LandmarkMeasurement, points_of
 from fgloc.stats import chi2_bound
 from fgloc.types import Decision, Step
@@ -363,6 +364,7 @@ class JudgedSightings:
         decisions: rows of ``steps.csv``, one per sighting.
         places: rows for places that sightings tell beside the predicted one.
         predicted: the pose that they were held against.
+        lines: the accepted ones linearized there; None: there is none, or that pose is too uncertain for it to hold.
         elsewhere: where on the map the robot is instead; None: it is where it was predicted.
     """
 
@@ -371,6 +373,7 @@ class JudgedSightings:
     logged: Sequence[LandmarkFactor]
     decisions: Sequence[Decision]
     predicted: PoseWithCovariance
+    lines: Lines | None = None
     places: Sequence[Decision] = ()
     elsewhere: InitialPose | None = None
 
@@ -382,7 +385,7 @@ class JudgedSightings:
     def dropped(self, reason: str) -> JudgedSightings:
         """Judged sightings with none accepted, where the graph could not use any of them."""
         decisions = [replace(d, weight=0.0, reason=d.reason or reason) for d in self.decisions]
-        return replace(self, accepted=(), decisions=decisions)
+        return replace(self, accepted=(), decisions=decisions, lines=None)
 
 
 class SightingJudge:
@@ -465,7 +468,10 @@ class SightingJudge:
         if self._tracking.keeps_initial_pose:
             self.modes.forget()  # they all seem moved from there
         logged = () if self._tracking.keeps_initial_pose else [s for s in rejected if not s.measurement.unnamed]
-        return JudgedSightings(accepted, rejected, logged, decisions, predicted)
+        lines = None
+        if accepted and self._estimator.factors.known and is_linear(predicted):
+            lines = self._estimator.factors.linearize([s.measurement for s in accepted], predicted.pose)
+        return JudgedSightings(accepted, rejected, logged, decisions, predicted, lines)
 
     def exclude_displaced(self, k: int, step: Step, found: InitialPose) -> list[Decision]:
         """Leave out what the search found to be moved, and no longer what it found in place."""
@@ -488,7 +494,7 @@ class SightingJudge:
         """
         k = self._estimator.k
         belief = self._estimator.log.keyframes[k].belief
-        moved = self.modes.observe(motion.factors, seen.predicted, belief, seen.accepted, seen.logged)
+        moved = self.modes.observe(motion.factors, seen.predicted, belief, seen.accepted, seen.logged, seen.lines)
         if moved is None:
             return [], False
         without, nis = self.modes.exclude(moved, belief)
