@@ -1,10 +1,11 @@
 """Writes and executes docs/notebooks/*.ipynb; their cells are here, as text that can be reviewed.
 
-python docs/make_notebooks.py
+python docs/make_notebooks.py [NAME...]
 """
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import nbformat
@@ -12,24 +13,20 @@ from nbclient import NotebookClient
 
 FOLDER = Path(__file__).resolve().parent / "notebooks"
 FIRST = [
-    "# A first run\n\nSmooth a recording that comes with fgloc, and look at it. Nothing of it is made up for this page: "
-    "a test executes the notebook.",
+    "# A first run\n\nSmooth a recording that comes with fgloc, and look at it. The recording has a truth, so that errors "
+    "are known. NEES/3 is 1 on average if the covariance is right.",
     """%matplotlib inline
 from pathlib import Path
 
 import fgloc
 from fgloc.evaluation.metrics import compute_metrics, match_result
-from fgloc.evaluation.plots import plot_error
-from fgloc.evaluation.plots import plot_trajectory
+from fgloc.evaluation.plots import plot_error, plot_trajectory
 from fgloc_datasets import SAMPLE
 
 sample = SAMPLE.parent
 config = fgloc.load_config(sample / "robot.yaml")
 result = fgloc.run(sample / "bag", sample / "map.yaml", config, "batch")
-len(result.trajectory), result.notes""",
-    "The recording has a truth, so that errors are known. NEES/3 is 1 on average if the covariance is right.",
-    """metrics = compute_metrics(result, config)
-matched = match_result(result, config)
+metrics, matched = compute_metrics(result, config), match_result(result, config)
 print(f"{1e3 * metrics.ate_mean_m:.1f} mm, {metrics.yaw_mae_deg:.2f} deg, NEES/3 {metrics.nees_over_3:.2f}")""",
     """figure = plot_trajectory(result, matched)
 figure.set_dpi(90)
@@ -37,14 +34,12 @@ figure""",
     """figure = plot_error(result, matched)
 figure.set_dpi(90)
 figure""",
-    "What is the installation really? Given, found, and how well it is known:",
-    """for setting in result.found.settings[:8]:
-    print(f"{setting.name:24} {setting.given:7.3f} -> {setting.found:7.3f} +- {setting.sigma:.1g}")""",
-    "A pose at any time, and all files of a run:",
-    """stamp = int(result.trajectory.stamps_ns[100]) + 50_000_000  # ns
+    """# The installation: given, found, and how well it is known; then a pose at any time, and all files of the run
+for setting in result.found.settings[:8]:
+    print(f"{setting.name:24} {setting.given:7.3f} -> {setting.found:7.3f} +- {setting.sigma:.1g}")
+stamp = int(result.trajectory.stamps_ns[100]) + 50_000_000  # ns
 print(result.trajectory.interpolate(stamp).round(3))
-result.write(Path("first-run-out"))
-sorted(file.name for file in Path("first-run-out").iterdir())""",
+result.write(Path("first-run-out"))""",
 ]
 FAILURE = [
     "# A failure, and what saves the run\n\nThe camera is silent for 20 s on a slippery floor. Failures are filters of "
@@ -101,7 +96,7 @@ def notebook(cells: list[str]) -> nbformat.NotebookNode:
     made = nbformat.v4.new_notebook()
     made.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     for k, text in enumerate(cells):
-        code = not (text[0].isupper() or text.startswith("# "))
+        code = not (text[0].isupper() or text.startswith("# A "))
         cell = nbformat.v4.new_code_cell(text) if code else nbformat.v4.new_markdown_cell(text)
         cell["id"] = f"cell-{k}"
         made.cells.append(cell)
@@ -109,9 +104,11 @@ def notebook(cells: list[str]) -> nbformat.NotebookNode:
 
 
 def main() -> None:
-    """Write both, with their outputs."""
+    """Write both, or those that are named, with their outputs."""
     FOLDER.mkdir(exist_ok=True)
     for name, cells in NOTEBOOKS.items():
+        if sys.argv[1:] and name not in sys.argv[1:]:
+            continue
         made = notebook(cells)
         NotebookClient(made, timeout=600, resources={"metadata": {"path": FOLDER}}).execute()
         for cell in made.cells:

@@ -64,6 +64,16 @@ def end(label: str) -> None:
         listener(Advance(label, 0, None, ended=True))
 
 
+@contextmanager
+def working(label: str) -> Iterator[None]:
+    """Report work of unknown length while the block runs."""
+    tell(label, 0, None)
+    try:
+        yield
+    finally:
+        end(label)
+
+
 def counted(items: Iterable[T], label: str, total: float | None = None, unit: str = "") -> Iterator[T]:
     """Iterate over the items and report each one that is done."""
     try:

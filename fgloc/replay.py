@@ -212,6 +212,8 @@ class Replay:
             self._parts.diagnosis.observe(step, by_hand)
             if self._on_step is not None:
                 self._on_step(step, estimate)
+        if self._progress is not None:  # the last message is somewhat before the end
+            self._progress(self._duration_s, self._duration_s)
 
     def record(self, step: Step, estimate: Estimate | None, milliseconds: float) -> None:
         """Note the outcome and the time [ms] of one step."""
@@ -253,6 +255,8 @@ class Replay:
                 self.truth.add(passed)
                 self.activity.present(passed.topic)
             elif passed is not None:
+                if isinstance(passed, RawEvent):  # it arrived, even if none of its markers is on the map
+                    self.activity.present(passed.topic)
                 yield passed
 
     def _regated(self, events: Iterator[Event]) -> Iterator[Event]:

@@ -20,7 +20,7 @@ from fgloc.diagnosis.mistakes import Mistakes, find_mistakes, unused_sightings
 from fgloc.errors import EstimatorError
 from fgloc.evaluation.report import write_results
 from fgloc.graph.contradictions import Contradiction
-from fgloc.instrumentation import one_blas_thread
+from fgloc.instrumentation import one_blas_thread, working
 from fgloc.recording.info import unread_map
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
@@ -162,7 +162,8 @@ def run(
     """
     began = time.perf_counter()
     check = options.get("check", True) and options.get("events") is None and options.get("sightings") is None
-    wrong = find_mistakes(recording_path, map_path, config) if check else Mistakes((), config)
+    with working("checking"):
+        wrong = find_mistakes(recording_path, map_path, config) if check else Mistakes((), config)
     config = wrong.config
     with open_recording(recording_path, config.recording) as recording:
         parts = assemble(recording, map_path, config, mode == "batch" or map_path is None, wrong.landmark_map)
@@ -291,7 +292,8 @@ def replayed(
 
 def _smoothed(parts: Assembly, outcome: Outcome) -> SmoothedRun:
     try:
-        return smooth_run(parts)
+        with working("smoothing"):
+            return smooth_run(parts)
     except EstimatorError as error:
         raise EstimatorError(outcome.failed(sentence(str(error)))) from error
 

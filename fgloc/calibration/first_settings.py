@@ -23,7 +23,7 @@ from fgloc.recording.reader import Recording, is_derived
 from fgloc.recording.storage import find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
-from fgloc.sensors.base import FirstLook, FirstSection
+from fgloc.sensors.base import Asked, FirstLook, FirstSection
 from fgloc.sensors.maps import load_map
 from fgloc.types import Event, Finding, SightingsEvent, ordered
 
@@ -95,8 +95,16 @@ class _Seen:
     sections: tuple[FirstSection, ...]
 
 
-def first_settings(bag: Path) -> RobotFile:
+Ask = Callable[[Asked], Mapping[str, str] | None]
+"""Value of each key, or None: the user does not know."""
+
+
+def first_settings(bag: Path, ask: Ask | None = None) -> RobotFile:
     """Read a recording through and write the settings of the robot that it determines.
+
+    Args:
+        bag: the recording.
+        ask: asks the user for what it does not determine; None: nobody is there.
 
     Raises:
         RecordingError: nothing can be read.
@@ -121,6 +129,10 @@ def first_settings(bag: Path) -> RobotFile:
     text = "\n".join(lines) + "\n"
     for section in seen.sections:
         text = _with_lines(text, section.others)
+        for asked in section.asked:
+            if ask is not None and (values := ask(asked)):
+                text = _answered(text, asked, values)
+                missing.remove(asked.missing)
     compared = None if seen.info.problems else _compared(bag, text)
     found = () if compared is None else ordered(compared.findings)
     text = with_findings(text, found)
@@ -175,6 +187,14 @@ def _compared(bag: Path, text: str) -> Conventions:
         except FglocError:  # what is missing is said elsewhere; without it less can be compared
             pass
         return conventions(read_signals(recording, config), config, T_base_sensor, imu_up, landmark_map)
+
+
+def _answered(text: str, asked: Asked, values: Mapping[str, str]) -> str:
+    """A robot.yaml with the answers to questions, in place of the lines that were to be filled in."""
+    text = text.replace("\n".join(asked.replaced) + "\n", "")
+    section = next(iter(values)).rpartition(".")[0]
+    settings = [f"{key.rpartition('.')[2]}: {value}" for key, value in values.items()]
+    return _with_lines(text, {section: [f"  {line}" for line in (*asked.lines, *settings)]})
 
 
 def with_findings(text: str, findings: Sequence[Finding]) -> str:

@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from fgloc.cli import data, live, robot, runs
-from fgloc.cli.terminal import EXIT_BAD_INPUT, kept_on_interrupt, say, shown
+from fgloc.cli.terminal import EXIT_BAD_INPUT, examples, kept_on_interrupt, say, shown
 from fgloc.errors import FglocError
 
 
@@ -41,7 +41,7 @@ app = typer.Typer(
     cls=_Commands,
     help="Where a wheeled robot is, without GPS, with an honest covariance.",
     no_args_is_help=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -104,7 +104,7 @@ _COMMANDS: tuple[tuple[str, Callable[..., None], tuple[str, ...]], ...] = (  # w
     ("ablate", runs.ablate, ("fgloc ablate suite.yaml --out swept",)),
 )
 for _name, _command, _examples in _COMMANDS:
-    app.command(name=_name, epilog="\b\nExamples:\n" + "\n".join(f"  {line}" for line in _examples))(_command)
+    app.command(name=_name, **examples(*_examples))(_command)
 app.add_typer(data.sim_app, name="sim")
 app.add_typer(data.convert_app, name="convert")
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fgloc.cli.options import BAG_HELP, configured, need
-from fgloc.cli.terminal import group, kept_on_interrupt, next_step, say, shown_path, warn
+from fgloc.cli.terminal import examples, group, kept_on_interrupt, next_step, say, shown_path, warn
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
 
@@ -25,7 +25,12 @@ Download = Annotated[
 Url = Annotated[str | None, typer.Option("--url", metavar="ADDRESS", help="where --download finds it")]
 
 
-@convert_app.command()
+@convert_app.command(
+    **examples(
+        "fgloc convert mrclam MRCLAM_Dataset6 --out mrclam6",
+        "fgloc convert mrclam --download sets --dataset 6 --robot 1 --out robot1",
+    )
+)
 def mrclam(
     source: Annotated[Path | None, typer.Argument(metavar="SRC", help="folder of the unpacked set")] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for bag/, map.yaml and robot.yaml")] = Path("mrclam"),
@@ -63,7 +68,7 @@ def mrclam(
     _say_next(folder)
 
 
-@convert_app.command()
+@convert_app.command(**examples("fgloc convert drive husky.csv --windows 0-9 --out husky"))
 def drive(
     source: Annotated[Path | None, typer.Argument(metavar="CSV", help="file of the windows")] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for bag/, robot.yaml, windows.csv")] = Path("drive"),
@@ -113,7 +118,9 @@ def needed() -> None:
     need("sim", "fgloc sim")
 
 
-@sim_app.command()
+@sim_app.command(
+    **examples("fgloc sim record calibrated --seed 3 --out run3", "fgloc sim record suite --workers 4 --out runs")
+)
 def record(
     what: Annotated[
         str,
@@ -154,7 +161,7 @@ def record(
     next_step(f"fgloc smooth {shown_path(bag)} --out {shown_path(out / 'result')}", "localize with it")
 
 
-@sim_app.command(name="follow")
+@sim_app.command(name="follow", **examples("fgloc sim follow calibrated --path eight --out followed"))
 def follow_path(
     scenario: ScenarioArgument,
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder of bag/, map.yaml, following.csv, following.png")],
@@ -196,7 +203,7 @@ def follow_path(
     say(table(done))
 
 
-@sim_app.command()
+@sim_app.command(**examples("fgloc sim follow-demo --out follow-out"))
 def follow_demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder of following.png and following.txt")],
     workers: Annotated[int, typer.Option("--workers", min=1, help="processes")] = 2,
@@ -211,7 +218,7 @@ def follow_demo(
     say(f"\n{out / PICTURE}")
 
 
-@sim_app.command()
+@sim_app.command(**examples("fgloc sim figures run3 --out pictures"))
 def figures(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a recorded run")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="folder for the pictures")],
@@ -229,7 +236,7 @@ def figures(
 
 def train(
     inputs: Annotated[
-        list[Path], typer.Argument(metavar="CONFIG | BAG...", help="training configuration; with --init: recordings")
+        list[Path], typer.Argument(metavar="CONFIG | BAG", help="training configuration; with --init: recordings")
     ],
     out: Annotated[
         Path,

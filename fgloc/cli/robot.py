@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgloc.cli.options import Bag, Bags, ConfigOption, ForceOption, MapOption, ModelOption, configured, spare_inputs
-from fgloc.cli.terminal import exit_unless_trusted, next_step, run_bar, say, say_table, shown_path, typed, warn
+from fgloc.cli.terminal import (
+    ask,
+    asks,
+    exit_unless_trusted,
+    next_step,
+    run_bar,
+    say,
+    say_inputs,
+    say_table,
+    shown_path,
+    typed,
+    warn,
+)
 from fgloc.errors import ConfigError, MapError, OutputError, RecordingError
 from fgloc.files.atomic import check_out
 
@@ -24,14 +36,23 @@ if TYPE_CHECKING:
 def init(
     bag: Bag,
     out: Annotated[
-        Path, typer.Option("--out", metavar="ROBOT.yaml", dir_okay=False, help="configuration to be written")
-    ] = Path("robot.yaml"),
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="ROBOT.yaml",
+            dir_okay=False,
+            help="configuration to be written; default: robot.yaml beside the bag, where other commands read it",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Write a robot.yaml from a recording. It is commented; what the recording does not tell is a warning.
+    """Write a robot.yaml from a recording. At a terminal it asks for what the recording does not tell.
 
-    Exit code 1: no topic of it measures motion.
+    The file is commented. What is still missing is a warning. Exit code 1: no topic measures motion.
     """
+    from fgloc.recording.storage import beside, find_beside
+
+    out = out or find_beside(bag, "robot.yaml") or beside(bag, "robot.yaml")
     check_out(out, folder=False)
     if out.exists() and not force:
         raise OutputError(f"{out}: is there already; give another --out, or --force to replace it")
@@ -39,9 +60,8 @@ def init(
     from fgloc.config import base_roles, load_config
     from fgloc.files.outputs import write_text
     from fgloc.motion_noise import with_motion_noise
-    from fgloc.recording.storage import find_beside
 
-    found = first_settings(bag)
+    found = first_settings(bag, ask if asks() else None)
     with run_bar("init") as progress:
         found = with_motion_noise(found, bag, progress)
     write_text(out, found.text)
@@ -53,18 +73,20 @@ def init(
     for sentence in found.missing:
         warn(sentence)
     say(f"configuration: {out}")
-    next_step(f"fgloc info {shown_path(bag)} --config {shown_path(out)}", "check the recording with it")
+    read = find_beside(bag, "robot.yaml")  # by commands that are given none
+    given = "" if read is not None and read.resolve() == out.resolve() else f" --config {shown_path(out)}"
+    next_step(f"fgloc info {shown_path(bag)}{given}", "check the recording with it")
     if not {"odometry", "joints", "command", "imu"} & found.roles.keys():
         raise typer.Exit(1)  # no run is possible
     if not {"image", "sightings"} & base_roles(found.roles):
         return  # nothing to survey, or to calibrate on
-    beside = find_beside(bag, "map.yaml")
-    if beside is None:
-        next_step(f"fgloc map {shown_path(bag)} --config {shown_path(out)} --out map.yaml", "survey the markers")
+    landmarks = find_beside(bag, "map.yaml")
+    if landmarks is None:
+        file = shown_path(out.parent / "map.yaml")
+        next_step(f"fgloc map {shown_path(bag)}{given} --out {file}", "survey the markers")
     else:
         next_step(
-            f"fgloc calibrate {shown_path(bag)} --map {shown_path(beside)} --config {shown_path(out)} "
-            "--out calibrated.yaml",
+            f"fgloc calibrate {shown_path(bag)} --map {shown_path(landmarks)}{given} --out calibrated.yaml",
             "find what wheels, camera and clocks are off by",
         )
 
@@ -78,7 +100,9 @@ def info(bag: Bag, map_file: MapOption = None, config: ConfigOption = None) -> N
     if map_file is not None and not map_file.exists():
         raise MapError(f"{map_file}: there is no such file; give the map, or leave --map out")
     map_path = map_file or find_beside(bag, "map.yaml")
-    found = inspect_all(bag, map_path, configured(bag, config, None))
+    settings = configured(bag, config, None)
+    say_inputs(bag, map_file, config, "none")
+    found = inspect_all(bag, map_path, settings)
     say(format_info(found), nl=False)
     if found.exit_code:
         raise typer.Exit(found.exit_code)
@@ -228,6 +252,7 @@ def calibrate(
     check_out(out, folder=False)
     spare_inputs(out, bags[0], map_file, config, force, folder=False)
     before = configured(bags[0], config, None)
+    say_inputs(bags[0], map_file, config)
     with run_bar("calibrate") as progress:
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")

@@ -40,6 +40,7 @@ from fgloc.cli.terminal import (
     number,
     run_bar,
     say,
+    say_inputs,
     say_remark,
     say_table,
     typed,
@@ -86,7 +87,7 @@ def demo(
         code = code or exit_code(result)
     say(f"{runs[0][1].duration_s:.0f} s of {SAMPLE.parent.name}, {runs[0][1].keyframes} keyframes\n")
     say_table(("", "ATE mean", "ATE rmse", "yaw MAE", "NEES/3", "real time"), [_demo_row(*r) for r in runs])
-    say("")
+    say("\nNEES/3: 1 is expected on average over many runs; errors last for seconds, and one minute scatters widely.\n")
     for mode, _ in runs:
         say(f"{mode:<8}{out / mode / 'report.html'}")
     if code:
@@ -110,12 +111,13 @@ def smooth(
     if len(bags) > 1:
         if rrd is not None or mcap is not None or figures:
             raise ConfigError("--rrd, --mcap, --figures: expected one bag; give each its own command")
+        _say_inputs_of_many(map_file, config)
         smooth_many(bags, out, map_file, model, config, workers, scheduler)
         return
     (bag,) = bags
     forms = figure_formats(figures)
     spare_inputs(out, bag, map_file, config, force)
-    _say_inputs(bag, map_file, config)
+    say_inputs(bag, map_file, config)
     result = _localize(bag, map_file, configured(bag, config, model), out, "batch")
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
@@ -136,22 +138,14 @@ def online(
     forms = figure_formats(figures)
     pace = 1.0 if speed is Speed.REAL_TIME else None
     spare_inputs(out, bag, map_file, config, force)
-    _say_inputs(bag, map_file, config)
+    say_inputs(bag, map_file, config)
     result = _localize(bag, map_file, configured(bag, config, model), out, "online", pace)
     _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
 
 
-def _say_inputs(bag: Path, map_file: Path | None, config_file: Path | None) -> None:
-    """Print which map and configuration are read, also where they were not asked for."""
-    from fgloc.recording.storage import find_beside
-
-    for given, name, without in (
-        (map_file, "map", "none: landmarks are estimated with the trajectory"),
-        (config_file, "robot", "defaults"),
-    ):
-        file = given or find_beside(bag, f"{name}.yaml")
-        used = without if file is None else f"{file}" + ("" if given else " (beside the recording)")
-        say(f"{'configuration' if name == 'robot' else name}: {used}")
+def _say_inputs_of_many(map_file: Path | None, config_file: Path | None) -> None:
+    for given, name in ((map_file, "map"), (config_file, "configuration")):
+        say(f"{name}: {given or 'of each recording that which lies beside it, if any'}")
 
 
 def _localize(
@@ -196,6 +190,8 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
         align = " --align" if result.config is not None and result.config.truth.align != "none" else ""
         rows.append(("evo", f"evo_ape tum {out / 'truth.tum'} {out / 'trajectory.tum'}{align}"))
     rows += [(name, str(path)) for name, path in (("MCAP", mcap), ("rerun", rrd)) if path is not None]
+    if mcap is not None:
+        rows.append(("Foxglove", f"layout: {foxglove_layout()}"))
     for finding in metrics.findings:
         if finding.severity != "note":
             say_remark(finding.severity, finding.text)
@@ -341,9 +337,17 @@ def export(
     if mcap is not None:
         write_mcap(results, mcap, _base_frame(results.provenance.get("config")))
         say(f"MCAP: {mcap}")
+        say(f"Foxglove layout: {foxglove_layout()}")
     if kitti is not None:
         write_kitti(kitti, results.trajectory)
         say(f"KITTI: {kitti}")
+
+
+def foxglove_layout() -> Path:
+    """The layout that shows what ``--mcap`` writes; it comes with the package."""
+    import fgloc.view
+
+    return Path(fgloc.view.__file__).parent / "foxglove.json"
 
 
 def write_for_viewers(result: RunResult, rrd: Path | None, mcap: Path | None) -> None:
@@ -385,7 +389,7 @@ def evaluate(
     ] = Align.NONE,
     max_gap: Annotated[float, typer.Option(metavar="S", help="the truth is not interpolated across longer gaps")] = 0.2,
 ) -> None:
-    """Compare two TUM trajectories."""
+    """Compare two TUM trajectories. The truth is interpolated at the estimate's stamps; evo takes its nearest pose."""
     from fgloc.evaluation import metrics
     from fgloc.evaluation.metrics import match
     from fgloc.files.outputs import read_tum
@@ -403,7 +407,12 @@ def evaluate(
         ("RPE per metre, position", "-" if relative is None else f"{relative.translation_m:.6f} m"),
         ("RPE per metre, yaw", "-" if relative is None else f"{relative.rotation_deg:.6f} deg"),
     ]
+    size = metrics.size_of(matched)
+    if size is not None:
+        rows.append(("scale, Sim(3)", f"{size.scale:.6f}"))
     say_table(None, rows)
+    if size is not None and size.told:
+        say_remark("warning", size.sentence)
 
 
 def compare(

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
+from typer.core import TyperCommand
 
 from fgloc.instrumentation import Advance, end, tell, told_to
 
 if TYPE_CHECKING:
     from fgloc.replay import Progress
     from fgloc.runner import RunResult
+    from fgloc.sensors.base import Asked, Question
 
 
 EXIT_BAD_INPUT = 1
 EXIT_LOST = 3
 EXIT_INTERRUPTED = 130
+_MAPPED = "none: landmarks are estimated with the trajectory"
 
 
 def say(text: str, err: bool = False, nl: bool = True) -> None:
@@ -72,6 +79,36 @@ def kept_on_interrupt(kept: str = "of this result nothing was written; an earlie
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
+class Command(TyperCommand):
+    """A command whose help names arguments as they are typed, without the types of Python."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Parts of the usage line: ``BAG...``, not ``{BAG}...``."""
+        return [piece.replace("{", "").replace("}", "") for piece in super().collect_usage_pieces(ctx)]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the lists of arguments and options."""
+        for kind, title in (("argument", "Arguments"), ("option", "Options")):
+            found = (p.get_help_record(ctx) for p in self.get_params(ctx) if p.param_type_name == kind)
+            rows = [(_named(name, kind == "option"), about) for name, about in filter(None, found)]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+
+def _named(name: str, is_option: bool) -> str:
+    """Left column of a list: a value without a name gets a letter for its type; alternatives, as <1|max>, stay."""
+    return re.sub(r" <(\w+)[^>|]*>", lambda kind: f" {_LETTERS.get(kind[1], 'TEXT')}" if is_option else "", name)
+
+
+_LETTERS = {"int": "N", "float": "X", "Path": "PATH", "path": "PATH"}
+
+
+def examples(*lines: str) -> dict[str, Any]:
+    """Class and last paragraph of a command: examples of it."""
+    return {"cls": Command, "epilog": "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)}
+
+
 def group(about: str) -> typer.Typer:
     """Typer application for a group of commands."""
     return typer.Typer(help=about, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -90,6 +127,50 @@ def say_remark(kind: str, text: str, err: bool = False) -> None:
     typer.echo(f"{head} {_plain(text)}", err=err)
 
 
+def asks() -> bool:
+    """Whether somebody is there to answer: input and error stream are a terminal."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
+
+
+def ask(wanted: Asked) -> dict[str, str] | None:
+    """Answers of the user by setting; None where Enter says that one of them is not known.
+
+    Raises:
+        KeyboardInterrupt: by Ctrl-C, or at the end of the input.
+    """
+    say(f"Not in the recording: {wanted.missing}. Enter alone leaves it open.", err=True)
+    answers: dict[str, str] = {}
+    for question in wanted.questions:
+        try:
+            given = typer.prompt(
+                f"  {_plain(question.text)}", "", show_default=False, err=True, value_proc=partial(_answer, question)
+            )
+        except typer.Abort:
+            raise KeyboardInterrupt from None
+        if not given:
+            return None
+        answers |= dict.fromkeys(question.keys, given)
+    return answers
+
+
+def _answer(question: Question, text: str) -> str:
+    """An answer as it stands in YAML; empty where there is none."""
+    text = text.strip()
+    if not text:
+        return ""
+    if question.most is None:
+        if question.among and text not in question.among:
+            raise typer.BadParameter(f"{text!r} is not one of {', '.join(question.among)}")
+        return json.dumps(text, ensure_ascii=False)  # a JSON string is one of YAML
+    try:
+        value = float(text.replace(",", "."))
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= question.most:
+        raise typer.BadParameter(f"{text!r} is not a number of metres above 0, up to {question.most:g}")
+    return f"{value:g}"
+
+
 def next_step(command: str, why: str) -> None:
     """The command that a user is likely to want next."""
     say(f"next: {command}    # {why}")
@@ -98,6 +179,18 @@ def next_step(command: str, why: str) -> None:
 def shown_path(path: Path) -> str:
     """A path as it is typed in a shell."""
     return shlex.quote(str(path))
+
+
+def say_inputs(bag: Path, map_file: Path | None, config_file: Path | None, without_map: str = _MAPPED) -> None:
+    """Print which map and configuration are read, also where they were not asked for."""
+    from fgloc.recording.storage import find_beside
+
+    for given, file, name, without in (
+        (map_file, "map.yaml", "map", without_map),
+        (config_file, "robot.yaml", "configuration", "defaults"),
+    ):
+        found = given or find_beside(bag, file)
+        say(f"{name}: {without if found is None else found}{'' if given or not found else ' (beside the recording)'}")
 
 
 def say_table(head: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
@@ -255,6 +348,8 @@ def _line(of: Advance, seconds: float, before: float) -> str:
 
 
 def _amount(of: Advance) -> str:
+    if not of.done and of.total is None:  # of unknown length
+        return of.detail
     unit = f" {of.unit}" if of.unit else ""
     share = f" of {of.total:.0f}{unit} ({100.0 * of.done / of.total:.0f} %)" if of.total else unit
     return f"{of.done:.0f}{share}" + (f", {of.detail}" if of.detail else "")

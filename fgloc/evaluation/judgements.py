@@ -344,6 +344,8 @@ def _evidence(rows: Sequence[Decision], worst: Decision, statistic: float) -> st
         return "stamps of several sensors left the running time together"
     if worst.kind == "mode":
         bound = f", threshold {worst.threshold:.3g} s" if math.isfinite(worst.threshold) else ""
+        if not statistic and worst.reason == "lost":  # there is no last accepted sighting to count from
+            return f"no sighting was accepted before; {count}"
         return f"{statistic:.1f} s without an accepted sighting{bound}; {count}"
     if not math.isfinite(statistic) or statistic == 0.0:
         return count

@@ -209,7 +209,11 @@ _MOTION = ("odometry", "joints", "command")  # of which one is used
 
 
 def all_findings(
-    result: RunData, nees_over_3: float | None, rejections: Mapping[str, int], keyframes: int
+    result: RunData,
+    nees_over_3: float | None,
+    rejections: Mapping[str, int],
+    keyframes: int,
+    size: Size | None = None,
 ) -> tuple[Finding, ...]:
     """Findings of a run and the warnings by its figures, the gravest first.
 
@@ -218,9 +222,60 @@ def all_findings(
         nees_over_3: mean normalised squared error over 3; None: there is no truth.
         rejections: rejected items by ``sensor.reason``.
         keyframes: number of poses.
+        size: scale against the truth.
     """
-    warned = [*_optimistic(result, nees_over_3), *_dropped(result, rejections, keyframes)]
+    warned = [*_sized(size), *_optimistic(result, nees_over_3), *_dropped(result, rejections, keyframes)]
     return ordered([*result.findings, *warned])
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Scale of an estimate against its truth.
+
+    Attributes:
+        scale: distances of the estimate over those of the truth.
+        rigid_m: rmse of positions [m] after the best rigid motion, SE(2).
+        scaled_m: after the best similarity, Sim(2).
+    """
+
+    scale: float
+    rigid_m: float
+    scaled_m: float
+
+    @property
+    def told(self) -> bool:
+        """Whether the scale is what most of the error comes from."""
+        return abs(self.scale - 1.0) >= _SIZE_OFF and self.scaled_m < _SIZE_EXPLAINS * self.rigid_m
+
+    @property
+    def sentence(self) -> str:
+        """The scale, and where it may come from."""
+        return (
+            f"The estimate is {self.scale:.4g} times as large as the truth: scaled, its error would be "
+            f"{self.scaled_m:.3g} m (rmse) in place of {self.rigid_m:.3g} m. Distances come from marker sizes, the "
+            "map, ranges or wheel radii; or the truth is in another unit."
+        )
+
+
+_SIZE_OFF = 0.01  # share; smaller scales are lost in other errors
+_SIZE_EXPLAINS = 0.5  # largest share of the error that is left
+
+
+def size_of(matched: Matched) -> Size | None:
+    """Scale that fits an estimate to its truth best (Umeyama 1991, in the plane); None where nothing moved."""
+    estimate, truth = (poses[:, 0] + 1j * poses[:, 1] for poses in (matched.estimate, matched.truth))
+    estimate, truth = estimate - estimate.mean(), truth - truth.mean()
+    spread, common = float((abs(truth) ** 2).sum()), complex((truth.conj() * estimate).sum())
+    if spread < 1e-6 * len(truth) or not abs(common):
+        return None
+    scale, turned = abs(common) / spread, truth * common / abs(common)
+    left = [float(np.sqrt((abs(estimate - factor * turned) ** 2).mean())) for factor in (1.0, scale)]
+    return Size(scale, left[0], left[1] / scale)
+
+
+def _sized(size: Size | None) -> Iterator[Finding]:
+    if size is not None and size.told:
+        yield Finding("truth.size", size.sentence, Severity.WARNING, value=size.scale)
 
 
 def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
@@ -490,7 +545,16 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
         rejections=dict(sorted(result.rejections.items())),
         installation=_installation(result),
         findings=tuple(
-            map(FoundFinding.of, all_findings(result, honest[0], dict(sorted(result.rejections.items())), len(stamps)))
+            map(
+                FoundFinding.of,
+                all_findings(
+                    result,
+                    honest[0],
+                    dict(sorted(result.rejections.items())),
+                    len(stamps),
+                    against_truth(size_of),
+                ),
+            )
         ),
         judgements=judgements(result),
     )

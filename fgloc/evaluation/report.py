@@ -29,6 +29,7 @@ from fgloc.evaluation.plots import plot_error, plot_height, plot_protection, plo
 from fgloc.evaluation.style import FORMATS, Format, image_of, png
 from fgloc.files.atomic import atomic_folder
 from fgloc.files.outputs import (
+    RESULT_FORMAT,
     write_bytes,
     write_covariance_csv,
     write_json,
@@ -102,6 +103,8 @@ _PROTECTION = (
     "Each pose: the bound that was promised for it over its distance from the truth. Points below the line are wrong "
     "by more than their bound; without an alert these are dangerous."
 )
+_NEES = "NEES / 3 (honest: 1)"
+_OF_FINDING = {"covariance.optimistic": _NEES, "truth.size": "mean distance from truth"}  # tile by code
 Row = tuple[str, ...]
 
 
@@ -132,16 +135,18 @@ def content_of(result: RunData, metrics: Metrics, matched: Matched | None) -> di
 
 
 def _tiles(metrics: Metrics) -> list[Row]:
+    """Label, text and severity of each tile; the severity is that of the finding on the same figure, or empty."""
     shown = [
         ("mean distance from truth", _number(metrics.ate_mean_m, 1000.0, "{:.1f} mm")),
         ("mean yaw error", _number(metrics.yaw_mae_deg, 1.0, "{:.2f}°")),
         ("drift", _number(metrics.drift_percent, 1.0, "{:.2f} %")),
-        ("NEES / 3 (honest: 1)", _number(metrics.nees_over_3, 1.0, "{:.2f}")),
+        (_NEES, _number(metrics.nees_over_3, 1.0, "{:.2f}")),
         ("recording", _number(metrics.duration_s, 1.0, "{:.1f} s")),
         ("keyframes", str(metrics.keyframes)),
         ("times real time", _number(metrics.real_time_factor, 1.0, "{:.1f}×")),
     ]
-    return [(label, text) for label, text in shown if text != "–"]
+    severities = {_OF_FINDING[f.code]: f.severity for f in metrics.findings if f.code in _OF_FINDING}
+    return [(label, text, severities.get(label, "")) for label, text in shown if text != "–"]
 
 
 def _truth_line(result: RunData, matched: Matched | None) -> str:
@@ -360,6 +365,7 @@ def _provenance(result: RunData, config: Config, command: str, input_hash: str |
     """Content of ``config.json``: command, input, versions and configuration of a run."""
     source = None if result.source is None else str(result.source)
     return {
+        "format": RESULT_FORMAT,
         "command": command,
         "input": {"path": source, "sha256": input_hash},
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},

@@ -15,10 +15,11 @@ import numpy as np
 
 from fgloc.errors import TrajectoryError
 from fgloc.files.documents import read_text
-from fgloc.files.outputs import read_tum
+from fgloc.files.outputs import RESULT_FORMAT, read_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, Trajectory
 
+_UPDATE = "update fgloc, or run the recording again"
 _MOST_BYTES = 1 << 30  # of each file
 _REMEDY = "give the folder of a finished run (--out of fgloc smooth or fgloc online)"
 _MODES = {mode.value.lower(): mode for mode in Mode}
@@ -51,7 +52,7 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """Read the folder of a run.
+    """Read the folder of a run, also of an older version: what it did not write is missing.
 
     Raises:
         TrajectoryError: a file is missing, or a line of it is not what a run writes; the message names both.
@@ -61,6 +62,8 @@ def read_results(folder: Path) -> Results:
         raise TrajectoryError(f"{folder}: no such folder; {_REMEDY}")
     if not (folder / "trajectory.tum").is_file():
         raise TrajectoryError(f"{folder}: no trajectory.tum in it; {_REMEDY}")
+    provenance = _read_json(folder / "config.json")
+    _check_format(provenance.get("format", 0), folder)
     trajectory = _read_trajectory(folder)
     decisions = _read_steps(folder / "steps.csv")
     named = {d.stamp_ns: _MODES[d.reason] for d in decisions if d.kind == "mode" and d.reason in _MODES}
@@ -71,9 +74,16 @@ def read_results(folder: Path) -> Results:
         modes=tuple(named.get(stamp, Mode.OK) for stamp in trajectory.stamps_ns.tolist()),
         decisions=decisions,
         metrics=_read_json(folder / "metrics.json"),
-        provenance=_read_json(folder / "config.json"),
+        provenance=provenance,
         landmarks=load_map(map_file) if map_file.is_file() else None,
     )
+
+
+def _check_format(written: object, folder: Path) -> None:
+    if not isinstance(written, int) or not 0 <= written <= RESULT_FORMAT:
+        raise TrajectoryError(
+            f"{folder}: written by a newer fgloc (format {written!r}; this one reads up to {RESULT_FORMAT}); {_UPDATE}"
+        )
 
 
 def _read_trajectory(folder: Path) -> Trajectory:

@@ -42,6 +42,10 @@ _STEP_COLUMNS = (
 )
 
 
+RESULT_FORMAT = 1
+"""Version of result folders, in ``config.json``; 0: none is written there, before 1.0."""
+
+
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as TUM: ``t x y z qx qy qz qw``, t in seconds with all nine decimals.
 

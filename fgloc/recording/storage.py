@@ -104,6 +104,11 @@ def find_beside(bag: Path, name: str) -> Path | None:
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
+def beside(bag: Path, name: str) -> Path:
+    """Place of such a file where there is none: in the folder that holds the bag, or the storage file."""
+    return (bag if bag.name not in ("", "..") else bag.resolve()).parent / name
+
+
 def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[Path, ...]]:
     """Storage files of a recording, in order, and its metadata where used.
 

@@ -146,6 +146,40 @@ class FirstLook:
 
 
 @dataclass(frozen=True, slots=True)
+class Question:
+    """One thing that a user is asked for.
+
+    Attributes:
+        text: what it is, with its unit.
+        keys: settings that the answer becomes, such as ``wheels.track``.
+        most: the answer is a number above zero, up to this; None: it is a name.
+        among: the names that can be given; empty: any.
+    """
+
+    text: str
+    keys: tuple[str, ...]
+    most: float | None = None
+    among: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Questions whose answers, together, settle what the recording does not determine.
+
+    Attributes:
+        missing: the sentence of `FirstSection.missing` that they settle.
+        questions: about it.
+        lines: further settings of the section that come with the answers.
+        replaced: lines of the section that go: it was commented out, to be filled in.
+    """
+
+    missing: str
+    questions: tuple[Question, ...]
+    lines: tuple[str, ...] = ()
+    replaced: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class FirstSection:
     """Lines of a section of ``robot.yaml``, and sentences on values that the recording does not determine.
 
@@ -153,11 +187,13 @@ class FirstSection:
         lines: of the section, from its head.
         missing: sentences.
         others: lines of other sections, by the section's dotted name.
+        asked: questions about what is missing.
     """
 
     lines: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    asked: tuple[Asked, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

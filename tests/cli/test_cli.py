@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,7 +110,9 @@ def test_without_truth_the_run_is_still_done(tmp_path):
     code, stdout, _ = fgloc("smooth", seen, "--out", tmp_path / "out", "--mcap", tmp_path / "run.mcap")
     assert code == 0
     assert "ATE" not in stdout
-    assert stdout.splitlines()[-1].split() == ["MCAP", str(tmp_path / "run.mcap")]
+    written, layout = stdout.splitlines()[-2:]
+    assert written.split() == ["MCAP", str(tmp_path / "run.mcap")]
+    assert Path(layout.split()[-1]).is_file()
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ate_mean_m"] is None
 
 
@@ -252,6 +255,7 @@ def test_demo_runs_both_ways(bag, tmp_path, monkeypatch):
     for mode in ("batch", "online"):
         assert {file.name for file in (tmp_path / "out" / mode).iterdir()} == FILES_OF[mode]
         assert str(tmp_path / "out" / mode / "report.html") in stdout
+    assert stdout.count("NEES/3: 1 is expected") == 1
 
 
 @pytest.mark.slow

@@ -1,5 +1,9 @@
 """What a new user meets: help, version, missing extras, progress on a pipe, Ctrl-C, the first steps with a robot."""
 
+import contextlib
+import json
+import os
+import pty
 import re
 import shlex
 import signal
@@ -66,6 +70,36 @@ def test_examples_of_a_command_are_understood(name):
             assert context.params
 
 
+def below(command, words=()):
+    """Every command that is no group, by the words that lead to it."""
+    if not hasattr(command, "commands"):
+        yield words, command
+    for name, part in getattr(command, "commands", {}).items():
+        yield from below(part, (*words, name))
+
+
+@pytest.mark.parametrize("words", [words for words, _ in below(get_command(app))], ids=" ".join)
+def test_help_has_examples_and_names_values_as_they_are_typed(words):
+    code, out, _ = fgloc(*words, "--help")
+    assert code == 0
+    assert f"  fgloc {' '.join(words)}" in out.partition("Examples:")[2]
+    usage = out.partition("\n")[0]
+    assert not re.search(r"[{}]|\.{4}", usage), usage
+    assert not re.findall(r"<(?:list|int|float|str|path|Path)\b", out)
+    assert max(map(len, out.splitlines())) > 50
+    known = dict(below(get_command(app)))[words]
+    for example in re.findall(r"^ +fgloc ([^#\n]+)", known.epilog, re.MULTILINE):
+        arguments = shlex.split(example)[len(words) :]
+        with known.make_context(words[-1], arguments) as context:
+            assert context.params
+
+
+def test_help_is_as_wide_as_the_terminal():
+    command = [sys.executable, "-m", "fgloc", "smooth", "-h"]
+    done = subprocess.run(command, env=os.environ | {"COLUMNS": "110"}, capture_output=True, text=True, check=True)
+    assert 80 < max(map(len, done.stdout.splitlines())) <= 110
+
+
 def test_completion_is_offered():
     assert "--install-completion" in fgloc("--help")[1]
 
@@ -130,6 +164,16 @@ def test_the_time_left_of_resumed_work_is_of_what_was_done_now():
         now[0] = 10.0
         progress.tell("mean", 950, 1000, "iterations", "validation 3.2")
     assert lines == ["mean: 950 of 1000 iterations (95 %), validation 3.2, 10 s left"]
+
+
+def test_a_run_tells_when_it_checks_and_smooths_and_ends_at_its_end(bag, tmp_path):
+    told = []
+    with progress.told_to(told.append):
+        run(bag, None, config_of({}), "batch", lambda done, total: progress.tell("batch", done, total))
+    labels = list(dict.fromkeys(advance.label for advance in told))
+    assert labels == ["checking", "batch", "smoothing"]
+    last = [advance for advance in told if advance.label == "batch"][-1]
+    assert last.done == last.total
 
 
 def test_nobody_listens_by_default_and_counting_ends():
@@ -257,6 +301,56 @@ def test_init_of_a_recording_without_a_known_topic_writes_settings_and_exits_wit
     assert load_config(file) == config_of({})
 
 
+def write_joints(path):
+    """A recording without odometry: the geometry of the wheels is not in it."""
+    with BagWriter(path) as bag:
+        for k in range(60):
+            stamp = START_NS + k * 50_000_000
+            bag.joints("/joint_states", stamp, ("wheel_left", "wheel_right"), [0.1 * k, 0.12 * k])
+            bag.range_bearing("/landmarks", stamp, [(0, 2.0, 0.0)])
+    return path
+
+
+def at_a_terminal(answers, *arguments):
+    """Exit code and output of a command whose input, output and errors are a terminal, with a line for each prompt."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(sys.executable, [sys.executable, "-m", "fgloc.cli", *map(str, arguments)])
+    out, answers = b"", [*answers]
+    with contextlib.suppress(OSError):  # the terminal is closed at the end
+        while data := os.read(terminal, 4096):
+            out += data
+            if answers and out.endswith(b"]: "):
+                os.write(terminal, answers.pop(0).encode())
+                out += b"<"
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), out.decode()
+
+
+def test_init_asks_at_a_terminal_for_what_the_recording_does_not_tell(tmp_path):
+    bag = write_joints(tmp_path / "bags" / "run1")
+    code, out = at_a_terminal(["5 cm\n", "0,05\n", "0.3\n"], "init", bag)
+    assert code == 0
+    assert "'5 cm' is not a number of metres" in out
+    assert "radii and track of the wheels: measure them" in out
+    assert "warning: radii" not in out
+    wheels = load_config(tmp_path / "bags" / "robot.yaml").wheels  # where other commands read it
+    assert (wheels.source, wheels.left_joint, wheels.right_joint) == ("ticks", "wheel_left", "wheel_right")
+    assert (wheels.left_radius, wheels.right_radius, wheels.track) == (0.05, 0.05, 0.3)
+    assert f"next: fgloc info {bag} " in out
+    assert "--config" not in out
+
+
+def test_what_enter_leaves_open_is_still_to_be_filled_in(tmp_path):
+    bag = write_joints(tmp_path / "bags" / "run1")
+    code, out = at_a_terminal(["0.05\n", "\n"], "init", bag, "--out", tmp_path / "robot.yaml")
+    assert code == 0
+    assert "radii and track of the wheels: measure them" in out.partition("configuration:")[0].rpartition("warning:")[2]
+    assert "#   left_radius:   # m" in (tmp_path / "robot.yaml").read_text()
+    assert f"--config {tmp_path / 'robot.yaml'}" in out
+    code, out = at_a_terminal(["\x03"], "init", bag, "--out", tmp_path / "other.yaml")
+    assert (code, (tmp_path / "other.yaml").exists()) == (130, False)
+
+
 def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path):
     """As of the Pioneer: an odometry that is stamped days before it is received, beside markers with true stamps."""
     path, late = tmp_path / "run" / "bag", 14 * 86_400 * 10**9
@@ -329,6 +423,17 @@ def test_finished_runs_are_compared_with_each_other_and_with_the_truth(bag, tmp_
     assert first.split()[-1] == "-"
     assert 0.0 <= float(second.split()[-1]) < 0.5
     assert (tmp_path / "both.svg").read_bytes().startswith(b"<?xml")
+    file = tmp_path / "a" / "config.json"
+    now = json.loads(file.read_text())
+    assert now["format"] == 1
+    file.write_text(json.dumps({key: value for key, value in now.items() if key != "format"}))  # as before 1.0
+    assert fgloc("compare", tmp_path / "a", tmp_path / "b")[1] == out.partition("figure:")[0]
+    for later in (2, "x"):
+        file.write_text(json.dumps(now | {"format": later}))
+        for command in (("compare", tmp_path / "b", tmp_path / "a"), ("export", tmp_path / "a", "--kitti", "k.txt")):
+            code, _, err = fgloc(*command)
+            assert code == 1
+            assert f"{tmp_path / 'a'}: written by a newer fgloc (format {later!r}" in err
 
 
 @pytest.mark.parametrize("arguments", [("a",), ("a", "b", "--figure", "both.txt")])

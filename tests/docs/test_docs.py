@@ -154,6 +154,8 @@ def printed_in(cell):
 
 def test_there_are_two_notebooks():
     assert len(NOTEBOOKS) == 2
+    first = next(path for path in NOTEBOOKS if path.stem == "first_run")
+    assert len(json.loads(first.read_text(encoding="utf-8"))["cells"]) == 5
     for path in NOTEBOOKS:
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         assert any("image/png" in output.get("data", {}) for cell in cells for output in cell.get("outputs", ()))

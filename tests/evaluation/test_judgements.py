@@ -52,6 +52,15 @@ def test_adjacent_steps_are_one_episode_with_its_worst_statistic_and_what_it_wou
     assert found[0].when == "2.0–3.9 s"
 
 
+def test_a_robot_that_never_saw_a_landmark_is_lost_from_the_beginning():
+    rows = [replace(row(k, "mode", "lost", nis=0.0, threshold=math.nan), residual=0.0) for k in range(300)]
+    (j,) = judgements(run_of(*rows))
+    assert (j.kind, j.from_s, j.to_s) == ("lost", 0.0, 29.9)
+    assert j.evidence == "no sighting was accepted before; 300 steps"
+    later = [replace(r, residual=4.0 + 0.1 * r.step) for r in rows[200:]]
+    assert judgements(run_of(*later))[0].evidence.endswith(" s without an accepted sighting; 100 steps")
+
+
 def test_a_step_judged_again_counts_as_it_was_judged_last():
     (j,) = judgements(run_of(row(5, "wheels", "", weight=1.0), row(6, "wheels", "slip"), row(5, "wheels", "slip")))
     assert (j.from_step, j.to_step, j.rows) == (5, 6, 2)

@@ -95,6 +95,32 @@ def test_truth_based_metrics_are_null_without_truth(tmp_path):
     assert [key for key in KEYS if content[key] is None] == KEYS[3:13]
 
 
+@pytest.mark.parametrize(
+    ("factor", "narrow", "codes"),
+    [(1.0, 1.0, []), (1.06, 1.0, ["truth.size", "covariance.optimistic"]), (1.0, 100.0, ["covariance.optimistic"])],
+)
+def test_a_wrong_size_and_a_wrong_covariance_are_named_and_coloured(tmp_path, factor, narrow, codes):
+    """A map 6 % too large; a covariance a hundredth of what it should be: a NEES/3 of about 100 is not shown calmly."""
+    result = figure_eight()
+    t = result.trajectory
+    poses = t.poses * [factor, factor, 1.0]
+    changed = replace(result, trajectory=Trajectory(t.stamps_ns, poses, t.covs / narrow))
+    metrics = report.write_results(changed, CONFIG, tmp_path, COMMAND)
+    found = {f.code: f for f in metrics.findings}
+    assert [code for code in codes if code in found] == codes
+    assert ("truth.size" in found) == (factor != 1.0)
+    page = (tmp_path / "report.html").read_text()
+    banner = page.partition('<ul class="findings">')[2].partition("</ul>")[0]
+    assert [code in banner for code in codes] == [True] * len(codes)
+    tiles = re.findall(r'<div class="tile( \w+)?"><b>[^<]*</b><span>([^<]*)</span>', page)
+    coloured = {label.partition(" /")[0] for severity, label in tiles if severity == " warning"}
+    named = {"truth.size": "mean distance from truth", "covariance.optimistic": "NEES"}
+    assert coloured == {named[code] for code in codes}
+    if factor != 1.0:
+        assert found["truth.size"].value == pytest.approx(factor, abs=0.005)
+        assert f"{found['truth.size'].value:.4g} times as large as the truth" in found["truth.size"].text
+
+
 def test_bounds_on_the_error_are_written_and_held_against_the_truth(tmp_path):
     """One pose is wrong by more than its bound, another has no bound at all; both are told."""
     result = figure_eight()

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import fgloc
 from fgloc import se2
 from fgloc.cli import app
+from fgloc.cli.runs import foxglove_layout
 from fgloc.errors import OutputError, TrajectoryError
 from fgloc.estimation.log import mode_decisions
 from fgloc.evaluation.results import read_results
@@ -52,6 +53,24 @@ def test_mcap_holds_every_pose_with_its_covariance(tmp_path):
     assert len(path[1].poses) == len(t)
     assert len(found["/fgloc/map"][0][1].markers) == 2 * len(result.landmarks.landmarks)
     assert {m.transforms[0].child_frame_id for _, m in found["/tf"]} == {"base_footprint"}
+
+
+def test_the_layout_for_foxglove_shows_topics_that_are_written():
+    layout = json.loads(foxglove_layout().read_text())
+    panels = layout["configById"]
+    scene = panels["3D!fgloc"]["topics"]
+    plotted = {path["value"].partition(".")[0] for path in panels["Plot!fgloc"]["paths"]}
+    shown = {*scene, *plotted, panels["DiagnosticSummary!fgloc"]["topicToRender"]}
+    assert {"/fgloc/map", "/fgloc/path", "/fgloc/truth_path", "/fgloc/pose", "/diagnostics"} == shown
+    assert shown < set(TYPES)
+    places, arranged = [layout["layout"]], set()
+    while places:
+        place = places.pop()
+        if isinstance(place, dict):
+            places += [place["first"], place["second"]]
+        else:
+            arranged.add(place)
+    assert arranged == set(panels)
 
 
 def test_mcap_odometry_has_the_twist_of_the_base(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from robot_world import START_NS, World, beacons, config
 from world_bags import write_world
 
+import fgloc_datasets
 from fgloc import se2
+from fgloc.config import load_config
 from fgloc.errors import EstimatorError
 from fgloc.files.outputs import write_tum
 from fgloc.recording.storage import find_beside
@@ -219,3 +222,25 @@ def test_find_beside_looks_in_the_folder_and_in_the_one_that_holds_it(tmp_path):
     (bag / "map.yaml").touch()
     assert find_beside(bag, "map.yaml") == bag / "map.yaml"
     assert find_beside(file, "map.yaml") == bag / "map.yaml"
+
+
+def test_images_whose_markers_are_not_on_the_map_have_arrived(tmp_path):
+    """The error names the ids that were seen and those of the map, and does not say that no image came."""
+    sample = fgloc_datasets.SAMPLE.parent
+    text = (sample / "map.yaml").read_text()
+    (tmp_path / "map.yaml").write_text(re.sub(r"id: (\d)", r"id: 4\1", text))
+    config = load_config(sample / "robot.yaml")
+
+    def begun(events):
+        first = None
+        for event in events:
+            first = first or event.received_ns
+            if event.received_ns > first + 4_000_000_000:
+                return
+            yield event
+
+    with pytest.raises(EstimatorError) as caught:
+        run(sample / "bag", tmp_path / "map.yaml", config, "online", events=begun)
+    said = str(caught.value)
+    assert re.search(r"None of the ids that were seen \(\d[\d, ]*\) is in the map, which has 40, 41", said)
+    assert "no usable message" not in said

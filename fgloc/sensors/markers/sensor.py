@@ -14,11 +14,13 @@ from pydantic import Field
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.sensors.base import (
     SENSOR,
+    Asked,
     BuiltIn,
     EventInput,
     FirstLook,
     FirstSection,
     FirstSettings,
+    Question,
     Stream,
     When,
     byte_array,
@@ -27,7 +29,7 @@ from fgloc.sensors.cameras import marker_pose_candidates, marker_pose_cov, pinho
 from fgloc.sensors.checks import FieldChecks, RawChecks, SightingsChecks
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.landmarks import planar_yaw
-from fgloc.sensors.markers.detector import fitting_dictionary
+from fgloc.sensors.markers.detector import dictionary_names, fitting_dictionary
 from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners, decode
 from fgloc.sensors.measurements import LandmarkSighting, PixelMeasurement
 from fgloc.types import Camera, Event, FloatArray, Landmark, RawEvent, SightingsEvent
@@ -165,12 +167,17 @@ def _first_section(look: FirstLook) -> FirstSection:
         return FirstSection()
 
     lines, missing = ["markers:"], []
+    asked: list[Asked] = []
     dictionary = fitting_dictionary(look.recording)
     if dictionary is not None:
         lines.append(f"  dictionary: {dictionary}  # what is seen in the images fits it")
     else:
         lines.append("  # dictionary: DICT_4X4_50")
         missing.append("the dictionary of the markers: no marker was found in the images (markers.dictionary)")
+        which = Question(
+            "Dictionary of the markers, such as DICT_4X4_50", ("markers.dictionary",), among=dictionary_names()
+        )
+        asked.append(Asked(missing[-1], (which,), replaced=(lines[-1],)))
     if look.has_map:
         lines.append("  # default_size_m:  # the map beside the bag has the sizes")
     else:
@@ -178,6 +185,8 @@ def _first_section(look: FirstLook) -> FirstSection:
         missing.append(
             "the size of the markers: measure the side of the black square and give it (markers.default_size_m)"
         )
+        side = Question("Side of the markers' black square [m]", ("markers.default_size_m",), 5.0)
+        asked.append(Asked(missing[-1], (side,), replaced=(lines[-1],)))
     lines.append("  sigma_px: 0.1  # of a corner: 0.1 for a sharp camera, 0.3 for one that shakes")
     if "camera_info" not in roles:
         lines += [
@@ -185,7 +194,7 @@ def _first_section(look: FirstLook) -> FirstSection:
             "# The recording has no CameraInfo:",
             "# camera: {file: camera.yaml}  # as camera_calibration writes it",
         ]
-    return FirstSection(tuple(lines), tuple(missing))
+    return FirstSection(tuple(lines), tuple(missing), asked=tuple(asked))
 
 
 FIRST_SETTINGS = FirstSettings((), _first_section)

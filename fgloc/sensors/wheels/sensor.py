@@ -14,12 +14,14 @@ import numpy as np
 from fgloc.config import Config
 from fgloc.errors import ConfigError
 from fgloc.sensors.base import (
+    Asked,
     BuiltIn,
     Channel,
     FirstLook,
     FirstSection,
     FirstSettings,
     Mounting,
+    Question,
     RawMistake,
     Signal,
     Stream,
@@ -282,7 +284,20 @@ def _first_section(look: FirstLook) -> FirstSection:
         )
     else:
         missing = "radii and track of the wheels: measure them (wheels.left_radius, right_radius, track)"
-    return FirstSection((head, *_to_fill_in(pair)), (missing,))
+    lines = _to_fill_in(pair)
+    return FirstSection((head, *lines), (missing,), asked=(_asked(pair, names, missing, lines),))
+
+
+def _asked(pair: WheelPair | None, names: tuple[str, ...], missing: str, lines: tuple[str, ...]) -> Asked:
+    """Questions on the geometry of two wheels, and on their joints where their names do not tell."""
+    sides = () if pair is not None else ("left", "right")
+    questions = (
+        *(Question(f"Joint of the {side} wheel", (f"wheels.{side}_joint",), among=names) for side in sides),
+        Question("Radius of the wheels [m]", ("wheels.left_radius", "wheels.right_radius"), 10.0),
+        Question("Track, the distance of the wheels' contact points [m]", ("wheels.track",), 10.0),
+    )
+    known = () if pair is None else (f"left_joint: {pair.left}", f"right_joint: {pair.right}")
+    return Asked(missing, questions, ("source: ticks", *known), lines)
 
 
 def _found(pair: WheelPair, geometry: WheelGeometry) -> tuple[str, ...]:
