@@ -2,7 +2,7 @@
 
     python docs/make_gallery.py [--ablation DIR]
 
-DIR: results of ``fgloc ablate``; without it the ablation's picture stays as it is.
+DIR: results of ``fgloc ablate ablations/first.yaml``; without it the ablation's picture stays as it is.
 """
 
 from __future__ import annotations
