@@ -315,6 +315,7 @@ def at_a_terminal(answers, *arguments):
     """Exit code and output of a command whose input, output and errors are a terminal, with a line for each prompt."""
     pid, terminal = pty.fork()
     if pid == 0:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background job ignores it
         os.execv(sys.executable, [sys.executable, "-m", "fgloc.cli", *map(str, arguments)])
     out, answers = b"", [*answers]
     with contextlib.suppress(OSError):  # the terminal is closed at the end
