@@ -561,7 +561,7 @@ def diagnosis_of(
 
 # --- After a run ------------------------------------------------------------------------------------------------------
 
-_CLOCK_REASONS = ("late", "future", "stray", "stamp_zero", "duplicate", "duplicate_stamp")
+_CLOCK_REASONS = ("late", "future", "stray", "stamp_zero", "duplicate", "duplicate_stamp", "copy")
 
 
 def unused_sightings(rejections: Mapping[str, int], roles: Mapping[Role, str], used: int) -> tuple[str, ...]:

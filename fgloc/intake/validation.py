@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,68 @@ from fgloc.config import Config, GateConfig, camera_role
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
 from fgloc.sensors.checks import EMPTIED, Changes, FieldChecks
-from fgloc.types import Event, MotionEvent, TransformEvent, TruthEvent
+from fgloc.types import Event, MotionEvent, SightingsEvent, TransformEvent, TruthEvent
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
 _MOST_NOTES, _LONGEST_NOTE = 40, 1000  # sentences, and characters of one
-_OTHER_FRAMES = 20  # messages, without one of the frames before: the publisher is another one from then on
+_OTHER_FRAMES = 20  # messages, without one of the frames before for ...
+_SILENT_NS = 1_000_000_000  # ... so long: the publisher is another one from then on
 _LEAST_SCALE = 1e-3  # of a rate: no unit of angle is smaller
+
+# --- Copies of messages -----------------------------------------------------------------------------------------------
+
+_MOST_CONTENTS = 1000  # messages of a topic that are remembered: 30 s of a fast camera
+_OVERTAKEN_NS = 100_000_000  # messages overtake each other on their way by as much
+_OLDEST_NS = 60_000_000_000  # a stamp further back is of a clock that was set back, or of none
+
+
+class Contents:
+    """Finds copies of a topic's sightings that claim to be older than the first of them.
+
+    Noise makes each measurement differ from all others in its last digits: landmarks with the same values to the digit
+    are one measurement. Where the robot stands and the sensor has no noise, or coarse digits, they come again with
+    later stamps. With an earlier stamp they are a copy by a node that stamps wrongly. Copies agree with each other, so
+    that together they overrule a prediction that is right.
+
+    Several detectors with different delays, messages that overtake each other, and clocks that are set back bring other
+    values, or the same with the stamps that they had: these pass.
+
+    Attributes:
+        copies: how many there were.
+    """
+
+    def __init__(self) -> None:
+        """Start without messages."""
+        self.copies = 0
+        self._first_ns: dict[bytes, int] = {}  # first stamp of a content, the one that was heard last at the end
+
+    def is_copy(self, event: SightingsEvent) -> bool:
+        """Whether the event is a copy with an earlier stamp; else it is remembered."""
+        if not event.sightings:
+            return False
+        content, stamp = _digest(event), event.stamp_ns
+        first = self._first_ns.pop(content, stamp)
+        back = first - stamp
+        copy = _OVERTAKEN_NS < back <= _OLDEST_NS
+        self._first_ns[content] = stamp if 0 < back <= _OVERTAKEN_NS else first
+        if len(self._first_ns) > _MOST_CONTENTS:
+            del self._first_ns[next(iter(self._first_ns))]
+        self.copies += copy
+        return copy
+
+
+def _digest(event: SightingsEvent) -> bytes:
+    """Digest of the landmarks of a message with all their values; the same frame by another name does not change it."""
+    digest = hashlib.blake2b(digest_size=16)
+    for one in event.sightings:
+        for each in fields(one):
+            value = getattr(one, each.name)
+            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+            digest.update(b";")
+    return digest.digest()
+
+
+# --- The gate ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
@@ -27,6 +84,7 @@ class _Topic:
     """State of one topic: stamps and gaps."""
 
     newest_ns: int
+    used_ns: int  # when the last message that is used was received
     recent: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     gaps: int = 0
     longest_gap_ns: int = 0
@@ -61,14 +119,16 @@ class EventValidator:
     - A part that cannot be used is NaN in the copy and the rest is kept. Odometry: ``position`` and ``orientation``, or
       ``linear`` and ``angular``. Joints: single entries of ``position``, ``velocity``, ``effort``. IMU:
       ``linear_acceleration``. Events without any usable part are rejected whole.
-    - Odometry or IMU of other frames than the topic's messages so far is rejected, until twenty running have the same.
+    - Odometry or IMU of other frames than the topic's messages so far is rejected, until those have been silent
+      for a second and twenty others have the same.
+    - Sightings that repeat a message of their topic to the digit, with an earlier stamp, are rejected (`Contents`).
     - Bad entries of sightings are taken out; if none is left the event is rejected. Bearings in [pi, 2 pi] are wrapped.
 
     ``rejections`` counts what was lost, by "sensor.reason". Sensors: odometry, command, joints, imu, image, sightings,
     truth, transform. Reasons: stamp_zero, duplicate_stamp; frame; non_finite, speed_bound, yaw_rate_bound, range_bound,
     position_bound, quaternion, negative_variance, asymmetric_cov, indefinite_cov (of odometry with ``pose_`` or
     ``twist_`` before them); length, position_non_finite, velocity_non_finite, effort_non_finite, position_bound,
-    wheel_rate_bound (joints); unavailable, acceleration (imu); empty, truncated (image); unknown_id,
+    wheel_rate_bound (joints); unavailable, acceleration (imu); empty, truncated (image); copy, unknown_id,
     corners_degenerate, corners_small, bearing_bound, bearing_unit (sightings).
 
     Camera information passes unseen: whoever makes a camera of it validates it. Transforms may have stamp 0.
@@ -96,6 +156,7 @@ class EventValidator:
         self._named = named or {}
         self._seen: Counter[str] = Counter()  # events by role
         self._topics: dict[str, _Topic] = {}
+        self._contents: defaultdict[str, Contents] = defaultdict(Contents)  # by topic
         self._checks: dict[type, tuple[str, Callable[[Any], Event | str]]] = {TruthEvent: ("truth", self._truth)}
         for stream in (*registry.streams(), *streams):
             self._checks[stream.event] = stream.role, stream.validate(self._parts)
@@ -123,6 +184,12 @@ class EventValidator:
                     f"{name}: {topic.gaps} silence(s) longer than {self._config.gap_s:g} s, "
                     f"the longest {topic.longest_gap_ns * 1e-9:.1f} s"
                 )
+        notes += [
+            f"{name}: {contents.copies} messages repeat an earlier one to the digit, with stamps before it, and were "
+            "rejected: see which nodes publish on this topic"
+            for name, contents in self._contents.items()
+            if contents.copies
+        ]
         return tuple(notes)
 
     def check(self, event: Event) -> Event | None:
@@ -140,7 +207,8 @@ class EventValidator:
         self._seen[sensor] += 1
         topic = self._topics.get(event.topic)
         frames = self._frames(event)
-        reason = self._stamp(event, topic) or self._frame(topic, frames)
+        copied = isinstance(event, SightingsEvent) and self._contents[event.topic].is_copy(event)
+        reason = "copy" if copied else self._stamp(event, topic) or self._frame(event, topic, frames)
         if not reason:
             checked = check(event)
             if not isinstance(checked, str):
@@ -179,14 +247,14 @@ class EventValidator:
         return tuple(named) if isinstance(event, MotionEvent) else ()
 
     @staticmethod
-    def _frame(topic: _Topic | None, frames: tuple[str, ...]) -> str:
+    def _frame(event: Event, topic: _Topic | None, frames: tuple[str, ...]) -> str:
         """Reason to reject a message of these frames, or ""."""
         if topic is None or topic.frames == frames:
             return ""
         if frames != topic.other and topic.votes == 0:
             topic.other = frames
         topic.votes += 1 if frames == topic.other else -1
-        if topic.votes >= _OTHER_FRAMES:
+        if topic.votes >= _OTHER_FRAMES and event.received_ns - topic.used_ns >= _SILENT_NS:
             return ""
         topic.stray += 1
         return "frame"
@@ -194,8 +262,8 @@ class EventValidator:
     def _remember(self, event: Event, topic: _Topic | None, frames: tuple[str, ...]) -> None:
         stamp = event.stamp_ns
         if topic is None:
-            topic = self._topics[event.topic] = _Topic(stamp)
-        topic.frames, topic.votes = frames, 0
+            topic = self._topics[event.topic] = _Topic(stamp, event.received_ns)
+        topic.frames, topic.votes, topic.used_ns = frames, 0, event.received_ns
         if stamp > topic.newest_ns:
             gap = stamp - topic.newest_ns
             if gap > self._config.gap_s * 1e9:
