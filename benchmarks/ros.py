@@ -3,7 +3,8 @@
 Source ROS's setup first; where rclpy is missing, the rows say so. A player in rclpy publishes bundled recordings.
 
 - ``ros.equal_mm``: largest distance between the node's poses and those of ``fgloc online`` on the same recording, at
-  common keyframes; ``ros.equal_keyframes``: the share of the latter's keyframes that were published.
+  common keyframes; ``ros.equal_keyframes``: the share of the latter's keyframes that were published. On a machine that
+  is too busy for all images the node drops some, and its poses are others: what it says of that is printed.
 - ``ros.rate_hz``: rate of the node's odometry as it is heard; ``ros.latency_ms_*``: from the sending of an image to the
   arrival of the pose of its exposure; ``ros.cpu_share``: processor time of the node with all of its processes, of one
   core. Each with 5 images a second, ``ros.fast_*`` with 30; ``*relay*`` is a node in rclpy that does nothing but read
@@ -93,7 +94,8 @@ def equal(kinds: Sequence[str], names: Sequence[str], rate: float) -> Iterator[R
                 rate=rate,
             )
             found.append(apart_mm(drive["poses"], sample))
-            print(f"{kind} {name}: {max(found[-1][0], default=np.nan):.4g} mm, {found[-1][1]:.3f}", file=sys.stderr)
+            off, share = found[-1]
+            print(f"{kind} {name}: {max(off, default=np.nan):.4g} mm, {share:.3f}; {drive['missed']}", file=sys.stderr)
     yield Row("ros.equal_mm", max(max(off, default=np.inf) for off, _ in found), n=len(found), unit="mm")
     yield Row("ros.equal_keyframes", min(share for _, share in found), n=len(found))
 

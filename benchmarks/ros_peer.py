@@ -331,9 +331,10 @@ def drive(
     rate: float = 1.0,
     namespace: str = "",
     simulated: bool = True,
+    beside: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """One drive: what was heard of the node, its log and its exit code."""
-    with graph() as peer:
+    """One drive: what was heard of the node, its log and its exit code; ``beside``: further topics, see `announce`."""
+    with graph() as peer, announced(beside or {}):
         prefix = f"/{namespace}" if namespace else ""
         heard = peer.hear(f"{prefix}/fgloc/pose", _POSE)
         odometry = peer.hear(f"{prefix}/fgloc/odometry", "nav_msgs/msg/Odometry")
@@ -360,11 +361,56 @@ def drive(
                 "frames": sorted({t.child_frame_id for _, t in transforms}),
                 "markers": sum(len(m.markers) for _, m in markers),
                 "diagnostics": None if status is None else [status.name, status.level[0], status.message],
-                "values": {} if status is None else {one.key: one.value for one in status.values},
+                "values": (values := {} if status is None else {one.key: one.value for one in status.values}),
+                "missed": {k: v for k, v in values.items() if k.startswith(("dropped", "lost")) or ".late" in k},
             }
         finally:
             code = node.end()
         return {**found, "code": code, "log": node.log}
+
+
+@contextmanager
+def announced(topics: Mapping[str, str]) -> Iterator[None]:
+    """Topics that a process beside this one publishes, see `announce`."""
+    beside = subprocess.Popen(command_of("announce", topics=topics), stdin=subprocess.PIPE) if topics else None
+    try:
+        yield
+    finally:
+        if beside is not None:
+            beside.kill()
+            beside.wait()
+
+
+def announce(topics: Mapping[str, str]) -> None:
+    """Publishers of topics, by a participant of fgloc's: it has message types that are not installed in this ROS."""
+    from fgloc.live.wire.participant import Participant
+
+    with Participant(int(os.environ["ROS_DOMAIN_ID"])) as one:
+        writers = [one.writer(topic, kind) for topic, kind in topics.items()]
+        sys.stdin.read()
+        del writers
+
+
+def failed(parameters: Mapping[str, Any], wrong: Mapping[str, str]) -> dict[str, Any]:
+    """Transitions that fail for parameters, one after the other, until all of them are right."""
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    with graph() as peer:
+        node = NodeProcess(peer, "", {**parameters, **wrong})
+        try:
+            steps = [["activate", node.change(3), node.state()]]
+            for name in wrong:
+                steps.append(["configure", node.change(1), node.state()])
+                text = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(parameters.get(name, "")))
+                request = SetParameters.Request(parameters=[Parameter(name=name, value=text)])
+                peer.call(SetParameters, f"{node.name}/set_parameters", request)
+            for name, transition in (("configure", 1), ("activate", 3), ("deactivate", 4), ("clean up", 2)):
+                steps.append([name, node.change(transition), node.state()])
+                time.sleep(0.5)  # its subscriptions are made by a timer
+        finally:
+            code = node.end()
+        return {"steps": steps, "code": code, "log": node.log}
 
 
 IMAGES = "/camera/image/compressed"  # of the bundled recordings

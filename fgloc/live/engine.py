@@ -206,6 +206,19 @@ _COMPARE_EVERY_S = 0.5  # or less often, where nothing new is to be compared
 _UNFOUND = (State.WAITING, State.DETECTING)
 
 
+def overload_notes(images: int, events: int) -> tuple[str, ...]:
+    """Sentences on so many images and other events that came faster than they could be used."""
+    found = []
+    if images:
+        found.append(
+            f"{images} image(s) dropped: they come faster than markers can be found in them; poses are not those of "
+            "a run on the recording; send smaller or fewer images, or free the processor"
+        )
+    if events:
+        found.append(f"{events} message(s) dropped: they come faster than they can be used; free the processor")
+    return tuple(found)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Settings:
     """Settings of a live run, as `Live` has them. Can be pickled."""
@@ -241,6 +254,7 @@ class Estimation:
         self._busy = threading.RLock()  # held while the run is used
         self._changed = threading.Condition()  # guards the queues and what follows; notified of every change
         self._dropped: Counter[str] = Counter()  # for overload, by role; images are counted by the worker
+        self._overflow = 0  # events among them that were too many
         self._notes: dict[str, None] = {read.note: None} if read.note else {}  # an ordered set
         self._step_s = self._longest_s = 0.0  # wall time of an update: mean of the last ones, and the longest
         self._outlet = outlet
@@ -279,6 +293,7 @@ class Estimation:
                 lost = self._inbox.popleft()
                 if isinstance(lost, Queued) and lost.event is not None:
                     self._dropped[role_name(lost.event, self._topics)] += 1
+                    self._overflow += 1
                     self._worker.discard(lost)
             self._changed.notify_all()
 
@@ -305,6 +320,7 @@ class Estimation:
             reordering_s = run.reordering_s
         with self._changed:
             rejections += worker.rejections
+            overload = overload_notes(worker.dropped, self._overflow)
             return LiveStatus(
                 running=running,
                 mode=None if newest is None else newest.mode,
@@ -319,7 +335,7 @@ class Estimation:
                 dropped=dict(self._dropped + Counter({"image": worker.dropped})),
                 rejections=dict(sorted(rejections.items())),
                 waiting_for=waiting,
-                notes=tuple(dict.fromkeys((*self._notes, *(f.text for f in findings)))),
+                notes=tuple(dict.fromkeys((*self._notes, *overload, *(f.text for f in findings)))),
                 findings=findings,
             )
 

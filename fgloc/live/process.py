@@ -30,7 +30,7 @@ from typing import Any, TypeAlias
 from fgloc.config import TopicsConfig
 from fgloc.errors import EstimatorError, FglocError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.live.engine import Estimation, Keep, LiveStatus, Settings
+from fgloc.live.engine import Estimation, Keep, LiveStatus, Settings, overload_notes
 from fgloc.live.extrapolation import Anchor, MotionParts, Outlet
 from fgloc.live.run import role_name
 from fgloc.types import Estimate, Event, LandmarkMap, MotionEvent, RawEvent, SensorEvent, SightingsEvent
@@ -74,6 +74,7 @@ class EstimationProcess:
         self._most_images = 0
         self._topics = TopicsConfig()
         self._dropped: Counter[str] = Counter()
+        self._dropped_images = 0  # among them
         self._numbers = itertools.count()
         self._asked: dict[int, Future[Any]] = {}
         self._status = LiveStatus()
@@ -134,6 +135,7 @@ class EstimationProcess:
             if silent_s > _SILENT_S:
                 notes = (_SILENT.format(silent_s),)
         dropped = dict(self._dropped + Counter(self._status.dropped))
+        notes += overload_notes(self._dropped_images, self._dropped.total() - self._dropped_images)
         return replace(self._status, dropped=dropped, notes=notes + self._status.notes)
 
     def save(self, path: Path) -> bool:
@@ -182,6 +184,7 @@ class EstimationProcess:
     def _drop(self, event: Event) -> None:
         self._waiting.remove(event)
         self._images -= isinstance(event, RawEvent)
+        self._dropped_images += isinstance(event, RawEvent)
         self._dropped[role_name(event, self._topics)] += 1
 
     def _ask(self, method: str, *arguments: Any) -> Future[Any]:

@@ -255,6 +255,7 @@ def test_under_overload_the_oldest_waiting_image_is_dropped(monkeypatch):
             assert live.wait(PATIENCE_S)
             status = live.status()
     assert status.dropped["image"] == len(images) - len(seen) > 5
+    assert [note for note in status.notes if note.startswith(f"{status.dropped['image']} image(s) dropped")]
     assert seen == sorted(seen)
     assert seen[-3:] == images[-3:]
 

@@ -39,6 +39,37 @@ def test_poses_are_those_of_an_online_run_and_map_frames_and_diagnostics_are_pub
     assert not [line for line in drive["log"] if "WARN" in line or "ERROR" in line]
 
 
+def test_a_topic_whose_message_type_is_not_installed_is_named_and_another_has_its_role(middleware):
+    """Sightings would have been used rather than images; the images are, and the node goes on."""
+    kind = "apriltag_msgs/msg/AprilTagDetectionArray"
+    drive = asked("drive", middleware, needed=list(ros_peer.INPUTS), rate=2.0, beside={"/detections": kind})
+    named = [line for line in drive["log"] if f"/detections ({kind}) cannot be read" in line]
+    assert len(named) == 1, drive["log"]
+    assert (drive["code"], drive["state"]) == (0, "active")
+    assert [line for line in drive["log"] if f"Subscribed: {ros_peer.IMAGES} (image)" in line]
+    assert drive["poses"]
+
+
+def test_transitions_that_fail_say_why_and_succeed_once_the_parameters_are_right(middleware):
+    """One that rclpy raises, for a name that no topic has, and one that fgloc expects, a missing file."""
+    wrong = {"topics.odometry": "no topic", "map": "/nowhere/map.yaml"}
+    found = ros_peer.ask("failed", middleware, 300.0, parameters=ros.parameters(SAMPLE), wrong=wrong)
+    assert found["steps"] == [
+        ["activate", False, "unconfigured"],
+        ["configure", False, "unconfigured"],
+        ["configure", False, "unconfigured"],
+        ["configure", True, "inactive"],
+        ["activate", True, "active"],
+        ["deactivate", True, "inactive"],
+        ["clean up", True, "unconfigured"],
+    ], found["log"]
+    assert found["code"] == 0
+    said = [line for line in found["log"] if "ERROR" in line]
+    assert [line for line in said if "/nowhere/map.yaml" in line]
+    assert [line for line in said if "on_configure: " in line and "topic name must not contain" in line]
+    assert not [line for line in said if "initialpose" in line]
+
+
 def test_robots_in_namespaces_hear_only_themselves(middleware):
     sample = SAMPLES / "installed_run"
     bags = [str(s / "bag") for s in (SAMPLE, sample)]

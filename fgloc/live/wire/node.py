@@ -173,6 +173,7 @@ class Teller:
 RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually ask for
 _ASKED_EVERY = 3  # turns: the motion sources are read at 17 Hz, which is most of the work; between, the speed is held
 _POLL_S = 0.2  # time between two looks at what there is on the wire
+_LOST = "{}: {} message(s) were lost on their way, as on a busy machine or network; poses lack what was in them."
 _INITIAL_POSE = "initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
@@ -292,7 +293,9 @@ class Node:
                 if status is not None:
                     teller.waiting(f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
                     teller.tell(*status.notes)
-                teller.tell(*self._take_notes())
+                teller.tell(
+                    *self._take_notes(), *(_LOST.format(topic, n) for topic, n in self._transport.lost().items())
+                )
                 stale = "" if status is None else status.stale
                 if bool(stale) != was_stale:
                     was_stale, next_diagnostics_s = bool(stale), 0.0
@@ -437,6 +440,7 @@ class Node:
         mode = None if status is None or status.stale else status.mode
         message, values = described(status)
         values |= {f"refused {topic}": str(n) for topic, n in self.refused.items()}
+        values |= {f"lost {topic}": str(n) for topic, n in self._transport.lost().items()}
         wrong = status is not None and (
             bool(status.alert) or any(f.severity is Severity.ERROR for f in status.findings)
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -300,6 +301,15 @@ class Participant:
     def has_volatile(self, topic: str) -> bool:
         """Whether one of the topic's publishers keeps nothing for late readers: a latched reader does not match it."""
         return topic in self._volatile
+
+    def lost(self) -> Mapping[str, int]:
+        """Messages that were lost on their way here, by topic."""
+        with self._lock:
+            readers = [*self._readers]
+        counts = Counter[str]()
+        for one in readers:
+            counts[one.publication.topic] += int(one.reader.get_sample_lost_status().total_count)
+        return +counts
 
     def writer(self, topic: str, message_type: str, latched: bool = False, messages: Messages | None = None) -> Writer:
         """A reliable writer; a latched one gives late readers what was written before (transient local)."""

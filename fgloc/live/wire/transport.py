@@ -74,6 +74,9 @@ class Transport(Protocol):
     def has_volatile(self, topic: str) -> bool:
         """Whether one of the topic's publishers keeps nothing for late readers: a latched reader does not match it."""
 
+    def lost(self) -> Mapping[str, int]:
+        """Messages that were lost on their way here, by topic, as far as the network tells."""
+
     def read(self, topic: str, message_type: str, on_message: Callable[[Any], None], latched: bool = False) -> None:
         """Deliver a topic's messages, as `Received`, from now on and one after the other."""
 

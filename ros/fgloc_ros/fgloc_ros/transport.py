@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -94,6 +96,8 @@ class RosTransport:
         self._subscriptions: list[Any] = []
         self._ending: list[Any] = []
         self._failure: Exception | None = None
+        self._unreadable: set[str] = set()  # topics that were named for that
+        self._lost: Counter[str] = Counter()  # messages, by topic
         self._messages = Messages()
         self._lock = threading.Lock()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulation time stands still
@@ -152,9 +156,21 @@ class RosTransport:
         found = set()
         for topic, kinds in self._node.get_topic_names_and_types():
             used = topic.startswith(space) or topic in self._named
-            if used and not topic.startswith(own) and len(kinds) == 1 and self._has_others(topic):
+            used = used and not topic.startswith(own) and len(kinds) == 1 and self._has_others(topic)
+            if used and self._is_readable(topic, kinds[0]):
                 found.add(Publication(topic, kinds[0]))
         return tuple(sorted(found, key=lambda p: (p.topic, p.message_type)))
+
+    def _is_readable(self, topic: str, message_type: str) -> bool:
+        """Whether the messages of a topic are installed; one that fgloc would read is named once in the log if not."""
+        try:
+            get_message(message_type)
+        except Exception as error:  # whatever the import of its package leads to
+            if topic not in self._unreadable and self._messages.type_hash(message_type):
+                self._unreadable.add(topic)
+                self._node.get_logger().error(f"{topic} ({message_type}) cannot be read: {error}; install its package")
+            return False
+        return True
 
     def _has_others(self, topic: str) -> bool:
         return int(self._node.count_publishers(topic)) > (topic in self._publishers)
@@ -163,6 +179,11 @@ class RosTransport:
         """Whether one of the topic's publishers keeps nothing for late readers."""
         infos = self._node.get_publishers_info_by_topic(topic)
         return any(info.qos_profile.durability is DurabilityPolicy.VOLATILE for info in infos)
+
+    def lost(self) -> Mapping[str, int]:
+        """Messages that were lost on their way here, by topic, as far as the middleware tells."""
+        with self._lock:
+            return dict(self._lost)
 
     def read(self, topic: str, message_type: str, on_message: Callable[[Any], None], latched: bool = False) -> None:
         """Deliver a topic's messages from now on, in the executor's thread; it also makes the subscription."""
@@ -202,7 +223,7 @@ class RosTransport:
         for topic, message_type, on_message, latched in wanted:
             try:
                 subscription = self._subscription(topic, message_type, on_message, latched)
-            except Exception as error:  # its messages are not installed, or the parameters of its QoS are none
+            except Exception as error:  # the parameters of its QoS are none
                 self._node.get_logger().error(f"{topic} ({message_type}) cannot be read: {error}")
                 continue
             with self._lock:
@@ -212,6 +233,10 @@ class RosTransport:
         depth = _LARGE_DEPTH if message_type in _LARGE else _LATCHED_DEPTH if latched else _READ_DEPTH
         reliability = ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT
         messages = self._messages_of(topic, message_type)
+
+        def lose(info: Any) -> None:
+            with self._lock:
+                self._lost[topic] += info.total_count_change
 
         def deliver(message: Any, info: Mapping[str, int]) -> None:
             source_ns = info["source_timestamp"] or time.time_ns()  # 0: the middleware does not say
@@ -226,6 +251,7 @@ class RosTransport:
             deliver,
             _profile(depth, reliability, latched),
             qos_overriding_options=None if latched else QoSOverridingOptions.with_default_policies(),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
             raw=messages is not None,
         )
 
