@@ -1,4 +1,4 @@
-"""Bounds on the error against the truth: ``python -m benchmarks.integrity [--quick] [--json FILE] [--seeds N]``.
+"""Bounds on the error against the truth: ``python -m benchmarks.integrity [--seeds N] [--hours H] [--jobs N]``.
 
 Runs online of the recordings of `benchmarks.installed` (test split), with its failures, and of those recordings of
 others whose truth is in the frame of their map, with what ``fgloc init`` writes. A pose exceeds its bound if its error
@@ -12,18 +12,23 @@ along the robot, across it or in yaw does. Of a robot that was carried away the 
 - ``integrity.alert_s``: from the first error beyond the limit to the first alert, the longest of all runs.
 - ``integrity.step_over_none``: time of the updates of the runs without failure, over the same without the bounds.
 - ``integrity.real.NAME``: share of the poses of a recording by others that exceed.
+- ``integrity.fleet.*``: the same figures of so many hours of `benchmarks.fleet`, ten minutes a drive, failures in turn,
+  every second drive with an installation drawn from twice the prior sigmas (``.twice``). ``--hours 0``: none.
 
-Constants were chosen with seeds 61 to 63; the others were not looked at before.
+Constants were chosen with seeds 61 to 63, and with seed 1 of the fleet, whose figures begin with seed 1000.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -32,6 +37,7 @@ import numpy as np
 import yaml
 from scipy.special import betaincinv
 
+from benchmarks import fleet
 from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field_recordings import RECORDINGS
 from benchmarks.installed import CASES
@@ -47,6 +53,7 @@ from fgloc.types import FloatArray, IntArray, Protection
 from fgloc_datasets.sim.camera import RenderError
 
 _APART_NS = 10_000_000_000
+_DRIVE_S = 600.0  # of the fleet
 _LIMIT_M, _LIMIT_RAD = 0.1, math.radians(2.0)
 
 
@@ -60,7 +67,7 @@ class Held:
     yaw: FloatArray  # (n,) absolute error [rad]
     bound: FloatArray  # (n,) on the position [m]
     bound_yaw: FloatArray  # (n,) [rad]
-    step_over_none: float = 1.0  # time of the updates over that without the bounds
+    step_over_none: float = 1.0  # time of the updates over that without the bounds; 1: not measured
 
     @property
     def samples(self) -> FloatArray:
@@ -132,49 +139,84 @@ def simulated(case: str, seed: int) -> Held | None:
     return replace(held(made.online, recorded.config, unknown), step_over_none=whole / (whole - spent[0]))
 
 
-def measure(quick: bool, seeds: int) -> Iterator[Row]:
-    """The simulated rows, then those of recordings by others."""
-    chosen = SEEDS["test"][:1] if quick else SEEDS["test"][-seeds:]
+def driven(drive: fleet.Drive) -> Held:
+    """A drive of the fleet."""
+    found = [(e.stamp_ns, error, e.protection) for e, error in drive.run() if e.protection is not None]
+    errors = np.abs(np.array([error for _, error, _ in found]))
+    bounds = np.array([protection.bound for *_, protection in found])
+    position = np.array([protection.position_m for *_, protection in found])
+    distance = np.hypot(errors[:, 0], errors[:, 1])
+    beyond = (errors > bounds).any(axis=1) | (distance > position)
+    stamps = np.array([stamp for stamp, *_ in found], dtype=np.int64)
+    return Held(stamps, beyond, distance, errors[:, 2], position, bounds[:, 2])
+
+
+def measure(quick: bool, seeds: int, hours: float, jobs: int) -> Iterator[Row]:
+    """The simulated rows, then those of recordings by others, then those of the fleet."""
+    chosen = SEEDS["test"][:1] if quick else SEEDS["test"][-seeds:] if seeds else ()
     cases = ("none", "slip") if quick else CASES
     runs: dict[str, list[Held]] = {}
     try:
         prepare(Take("installed", floor(case), "test", seed) for case in cases for seed in chosen)
-        for case in cases:
+        for case in cases if chosen else ():
             runs[case] = [run for seed in chosen if (run := simulated(case, seed)) is not None]
             print(f"{case}: {[int(run.beyond.sum()) for run in runs[case]]} poses exceed", flush=True)
     except RenderError as error:
         yield from not_run(["integrity.exceeded"], str(error))
     else:
-        yield from _rows(runs)
-    if not quick:
+        yield from _rows("integrity", runs) if runs else ()
+    if not quick and seeds:
         yield from _real()
+    if hours > 0.0:
+        yield from _fleet(0.1 if quick else hours, jobs)
 
 
-def _rows(runs: dict[str, list[Held]]) -> Iterator[Row]:
+def _fleet(hours: float, jobs: int) -> Iterator[Row]:
+    count = max(1, round(hours * 3600.0 / _DRIVE_S))
+    drives = [
+        fleet.Drive(fleet.CASES[i % len(fleet.CASES)], 1000 + i, 1.0 + (i // len(fleet.CASES)) % 2, _DRIVE_S)
+        for i in range(count)
+    ]
+    runs: dict[str, list[Held]] = {case: [] for case in fleet.CASES}
+    twice: list[Held] = []
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        for drive, run in zip(drives, pool.map(driven, drives), strict=True):
+            runs[drive.case].append(run)
+            twice += [run] if drive.factor > 1.0 else []
+            if run.beyond.any():
+                dangerous = int((run.beyond & ~run.alert & run.wrong).sum())
+                print(f"{drive}: {int(run.beyond.sum())} poses exceed, {dangerous} dangerous", flush=True)
+    yield from _rows("integrity.fleet", {case: of_case for case, of_case in runs.items() if of_case})
+    if twice:
+        shares = [float(run.beyond.mean()) for run in twice]
+        yield Row("integrity.fleet.exceeded.twice", float(np.mean(shares)), float(np.std(shares)), len(shares))
+
+
+def _rows(prefix: str, runs: dict[str, list[Held]]) -> Iterator[Row]:
     every = [run for of_case in runs.values() for run in of_case]
     samples = np.concatenate([run.samples for run in every])
     exceeded, n = int(samples.sum()), len(samples)
     hours = sum(float(run.stamps_ns[-1] - run.stamps_ns[0]) for run in every) * 1e-9 / 3600.0
-    yield Row("integrity.hours", hours, n=len(every), unit="h")
-    yield Row("integrity.exceeded", exceeded / n, n=n, unit="share")
+    yield Row(f"{prefix}.hours", hours, n=len(every), unit="h")
+    yield Row(f"{prefix}.exceeded", exceeded / n, n=n, unit="share")
     most = 1.0 if exceeded == n else float(betaincinv(exceeded + 1, n - exceeded, 0.975))
-    yield Row("integrity.exceeded.bound95", most, n=n, unit="share")
-    yield Row("integrity.exceeded.all", float(np.concatenate([r.beyond for r in every]).mean()), n=len(every))
+    yield Row(f"{prefix}.exceeded.bound95", most, n=n, unit="share")
+    yield Row(f"{prefix}.exceeded.all", float(np.concatenate([r.beyond for r in every]).mean()), n=len(every))
     for case, of_case in runs.items():
         shares = [float(run.beyond.mean()) for run in of_case]
-        yield Row(f"integrity.exceeded.{case}", float(np.mean(shares)), float(np.std(shares)), len(shares), "share")
+        yield Row(f"{prefix}.exceeded.{case}", float(np.mean(shares)), float(np.std(shares)), len(shares), "share")
     dangerous = sum(int((run.beyond & ~run.alert & run.wrong).sum()) for run in every)
-    yield Row("integrity.dangerous", dangerous, n=len(every), unit="poses")
+    yield Row(f"{prefix}.dangerous", dangerous, n=len(every), unit="poses")
     sound = runs["none"]
     bound, error = (np.concatenate(parts) for parts in ([r.bound for r in sound], [r.distance for r in sound]))
-    yield Row("integrity.tightness", float(np.median(bound) / np.quantile(error, 0.999)), n=len(sound))
+    yield Row(f"{prefix}.tightness", float(np.median(bound) / np.quantile(error, 0.999)), n=len(sound))
     for case in ("none", "slip", "dark30"):
         if of_case := runs.get(case, []):
             shares = [float((run.bound < _LIMIT_M).mean()) for run in of_case]
-            yield Row(f"integrity.available.{case}", float(np.mean(shares)), float(np.std(shares)), len(shares))
-    ratios = [run.step_over_none for run in sound]
-    yield Row("integrity.step_over_none", float(np.mean(ratios)), float(np.std(ratios)), len(ratios))
-    yield Row("integrity.alert_s", max(run.alert_s for run in every), n=len(every), unit="s")
+            yield Row(f"{prefix}.available.{case}", float(np.mean(shares)), float(np.std(shares)), len(shares))
+    if ratios := [run.step_over_none for run in sound if run.step_over_none > 1.0]:
+        yield Row(f"{prefix}.step_over_none", float(np.mean(ratios)), float(np.std(ratios)), len(ratios))
+    yield Row(f"{prefix}.alert_s", max(run.alert_s for run in every), n=len(every), unit="s")
 
 
 def _real() -> Iterator[Row]:
@@ -192,14 +234,15 @@ def _real() -> Iterator[Row]:
             yield Row(f"integrity.real.{one.name}", float(found.beyond.mean()), n=len(found.beyond), unit="share")
 
 
-def parsed(argv: Sequence[str] | None = None) -> tuple[int, list[str]]:
-    """The number of seeds, and what is left for `benchmarks.common.main`."""
+def parsed(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[str]]:
+    """Own options, and what is left for `benchmarks.common.main`."""
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--seeds", type=int, default=7, help="of the test split, the last ones")
-    known, rest = parser.parse_known_args(argv)
-    return known.seeds, rest
+    parser.add_argument("--seeds", type=int, default=7, help="of the test split, the last ones; 0: none")
+    parser.add_argument("--hours", type=float, default=50.0, help="of the fleet")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes, of the fleet")
+    return parser.parse_known_args(argv)
 
 
 if __name__ == "__main__":
-    _seeds, _rest = parsed()
-    main(lambda quick: measure(quick, _seeds), __doc__ or "", _rest)
+    _own, _rest = parsed()
+    main(lambda quick: measure(quick, _own.seeds, _own.hours, _own.jobs), __doc__ or "", _rest)

@@ -325,8 +325,8 @@ _WARM_UP_S = 20.0
 
 def run_of(
     config: Config, landmark_map: LandmarkMap, events: Iterable[Event], camera: Camera | None = None
-) -> Iterator[tuple[Step, float]]:
-    """Every step of a live run without its threads, and the processor time [s] of the run since the one before."""
+) -> Iterator[tuple[Step, Estimate | None, float]]:
+    """Step and estimate of a live run without its threads, and its processor time [s] since the one before."""
     held = iter(events)
     begun: list[Event] = []
     facts = LiveFacts(config, None, camera)
@@ -344,10 +344,10 @@ def run_of(
     for event in _chained(begun, held):
         began = time.thread_time()
         passed = run.check(event)
-        steps = [] if passed is None else [step for step, _ in run.use(passed, isinstance(passed, CornersEvent))]
+        steps = [] if passed is None else list(run.use(passed, isinstance(passed, CornersEvent)))
         spent += time.thread_time() - began
-        for step in steps:
-            yield step, spent / len(steps)
+        for step, estimate in steps:
+            yield step, estimate, spent / len(steps)
         spent = 0.0 if steps else spent
 
 
@@ -363,7 +363,7 @@ def million(count: int) -> Iterator[Row]:
     costs, memory, spent_s = [], [], 0.0
     events = circle(count / SIGHTINGS_HZ + _WARM_UP_S)
     with ProcessPoolExecutor(1, get_context("spawn")) as beside:
-        for k, (_, spent) in zip(range(count), run_of(circle_config(), circle_map(), events), strict=False):
+        for k, (*_, spent) in zip(range(count), run_of(circle_config(), circle_map(), events), strict=False):
             spent_s += spent
             if k % block == block - 1:
                 memory.append(resident_mb())
@@ -378,7 +378,7 @@ def million(count: int) -> Iterator[Row]:
 def _fresh_s() -> float:
     """Processor time of a keyframe of a run that has just begun [s]: how fast this machine is at the moment."""
     steps = run_of(circle_config(), circle_map(), circle(_FRESH / SIGHTINGS_HZ + _WARM_UP_S, seed=1))
-    return float(np.mean([spent for k, (_, spent) in enumerate(steps) if k >= _FRESH // 2]))
+    return float(np.mean([spent for k, (*_, spent) in enumerate(steps) if k >= _FRESH // 2]))
 
 
 def resident_mb() -> float:
@@ -404,7 +404,7 @@ def _ratio(recorded: Recorded, seed: int) -> float:
 
 def _cost(recorded: Recorded, landmark_map: LandmarkMap, events: Iterable[Event]) -> float:
     """Mean processor time of a keyframe [s]."""
-    return float(np.mean([spent for _, spent in run_of(recorded.config, landmark_map, events, recorded.camera)]))
+    return float(np.mean([spent for _, _, spent in run_of(recorded.config, landmark_map, events, recorded.camera)]))
 
 
 # --- Streams ----------------------------------------------------------------------------------------------------------

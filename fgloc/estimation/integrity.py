@@ -28,6 +28,7 @@ _DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and 
 _SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second, beside as many as they do show ...
 _SLIP_LASTS_S = 1.0  # ... each at most so long, at the speed of the wheels
 _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
+_UNBOUNDED = np.full(3, np.inf)
 _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
 
 
@@ -39,6 +40,7 @@ class ProtectionLevels:
         self._config, self._modes = config, modes
         samples = max(3600.0 / _INDEPENDENT_S, 1.0)
         self._risk = config.risk_per_hour / samples / 3.0  # of a sample and axis
+        self._fastest: FloatArray = np.zeros(2)  # speed and yaw rate since the last fix
         self._sigmas = -float(_quantile(np.array(0.5 * _NOISE_SHARE * self._risk)))
         self._radii = float(_radius(np.array(2.0 * _NOISE_SHARE * self._risk)))
 
@@ -57,23 +59,26 @@ class ProtectionLevels:
         variance = _OVERBOUND**2 * np.diag(cov)
         widest = _OVERBOUND**2 * float(np.linalg.eigvalsh(cov[:2, :2])[-1])  # variance in the worst direction
         names: list[str] = []
-        priors, biases, added = [], [], []
+        priors, biases, added, most = [], [], [], []  # most: that the fault alone can make
         for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED):
             names.append(f"landmark {landmark_id}")
             priors.append(share)
             biases.append(np.abs(bias))
             added.append(spread)
+            most.append(_UNBOUNDED)
+        now = np.array([np.hypot(speed[0], speed[1]), abs(speed[2])])
+        self._fastest = np.maximum(self._fastest, now) if since_fix_s > 0.0 else now
         if since_fix_s > 0.0:
             lasts_s = min(since_fix_s, _SLIP_LASTS_S)
-            linear = float(np.hypot(speed[0], speed[1])) * lasts_s
-            turn = (max(abs(float(speed[2])), _LEAST_RAD_S) if linear > 0.0 else abs(float(speed[2]))) * lasts_s
-            off = np.square([linear, 0.0, turn]) * (_CHECKED**2 if checked else 1.0)
-            off[1] = off[0]
+            linear, turn = self._fastest.tolist()
+            turn = max(turn, _LEAST_RAD_S) if linear > 0.0 else turn
+            off = np.square([linear * lasts_s, linear * lasts_s, turn * lasts_s]) * (_CHECKED**2 if checked else 1.0)
             expected = (_SLIP_PER_S + slips_per_s) * since_fix_s
             names.append("slip")
             priors.append(-math.expm1(-expected))
             biases.append(np.zeros(3))
             added.append(off * (1.0 + expected))
+            most.append(since_fix_s * np.array([linear, linear, turn]))
         bound, cause = self._sigmas * np.sqrt(variance), "noise"
         position = self._radii * math.sqrt(widest)
         if names:
@@ -81,9 +86,13 @@ class ProtectionLevels:
             tail = (1.0 - _NOISE_SHARE) * self._risk / len(names) / np.maximum(priors, 1e-300)
             matters = tail < 1.0
             sigmas, radii = -_quantile(np.minimum(0.5 * tail, 0.5)), _radius(np.minimum(2.0 * tail, 1.0))
-            off_by, spreads = np.array(biases) * matters[:, None], np.array(added)
-            each = off_by + sigmas[:, None] * np.sqrt(variance + spreads)
-            places = np.hypot(off_by[:, 0], off_by[:, 1]) + radii * np.sqrt(widest + spreads[:, :2].sum(axis=1))
+            off_by, spreads, far = np.array(biases) * matters[:, None], np.array(added), np.array(most)
+            noise, all_of_it = sigmas[:, None] * np.sqrt(variance), sigmas[:, None] * np.sqrt(variance + spreads)
+            each = off_by + np.minimum(all_of_it, noise + far)
+            spread = np.minimum(
+                radii * np.sqrt(widest + spreads[:, :2].sum(axis=1)), radii * np.sqrt(widest) + far[:, 0]
+            )
+            places = np.hypot(off_by[:, 0], off_by[:, 1]) + spread
             worst = int(np.argmax(places))
             if places[worst] > position:
                 position, cause = float(places[worst]), names[worst]

@@ -28,6 +28,7 @@ from fgloc.types import FloatArray, LandmarkMap, MotionMeasurement, MotionReadin
 _MAX_SEEDS = 6  # places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _MOST_SENSED = 64  # readings of registered sensors that are weighed together where no pose is known: two rows each
+_SELDOM_MISREAD = 3  # landmarks of one image: so many with wrong ids do not agree with any place
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried
 
 
@@ -60,6 +61,8 @@ class PlaceSearch:
         if not found:
             return None
         best = min(found, key=lambda agreed: (-agreed.share, agreed.fit.cost))
+        if known and not best.by_sensors and best.landmarks < _SELDOM_MISREAD and best.images < 2:
+            return None  # two misread ids agree with some place where markers hang in rows, but not twice
         return best if best.certain else None
 
     def _agreed(self, fit: Fit, fitted: PoseFit, sightings: Sequence[LandmarkMeasurement]) -> PoseConsensus | None:
@@ -90,6 +93,7 @@ class PlaceSearch:
             len(residuals),
             sum(residuals.values()) - se2.DOF,
             frozenset(seen - information_of.keys()),
+            len({m.stamp_ns for m in agreeing}),
             not any(m.of_landmark for m in agreeing),
         )
 

@@ -161,6 +161,7 @@ class PoseConsensus:
     landmarks: int
     redundancy: int  # residuals more than a pose has coordinates, each landmark counted once
     outlier_landmarks: frozenset[int]  # landmarks that it does not explain
+    images: int  # or other messages, of which it explains sightings
     by_sensors: bool = False  # from registered sensors alone
 
     @property

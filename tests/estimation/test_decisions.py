@@ -89,7 +89,7 @@ def test_landmarks_are_not_named_moved_where_it_is_the_given_pose_that_is_wrong(
 
 
 def consensus(share: float, redundancy: int, sigma: float, outliers=frozenset()) -> PoseConsensus:
-    return PoseConsensus(Fit(STILL, np.eye(3) * sigma**2, 0.1, 6), share, 2, redundancy, outliers)
+    return PoseConsensus(Fit(STILL, np.eye(3) * sigma**2, 0.1, 6), share, 2, redundancy, outliers, 1)
 
 
 def test_a_place_that_leaves_sightings_unexplained_is_known_better_and_checked():

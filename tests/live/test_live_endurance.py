@@ -217,7 +217,7 @@ def test_a_stream_faster_than_the_estimator_never_blocks_and_is_bounded(monkeypa
 def test_a_million_keyframes():
     """Cost of the last tenth over the first, and memory: as `benchmarks.live` has it."""
     seconds = np.zeros(_LONG)
-    for k, (_, spent) in zip(
+    for k, (*_, spent) in zip(
         range(_LONG), run_of(circle_config(), circle_map(), circle(_LONG / 5.0 + 20.0)), strict=False
     ):
         seconds[k] = spent
