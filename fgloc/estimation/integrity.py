@@ -1,27 +1,34 @@
 """Protection levels: bounds that the error of a pose exceeds with no more than a stated risk, also if a sensor lies.
 
-What may be wrong is a list of hypotheses, each with a prior: nothing but noise; one landmark displaced; a motion source
-wrong since the last fix. Under each the error of the pose has a normal distribution: the landmark modes follow, beside
+What may be wrong is a list of hypotheses, each with a prior: nothing but noise; one landmark displaced; wheels that
+slipped since the last fix, or just before it. Under each the error of the pose has a normal distribution: the landmark modes follow, beside
 the estimator, how a displacement that has not been found out moves the pose and how likely it still is. The bound is
 the least one that keeps the probability of a larger error, over all hypotheses together, within the risk.
 
-Sources: Blanch, Walter, Enge et al. 2015, "Baseline advanced RAIM user algorithm and possible improvements" (a bound
-for each hypothesis from its share of the risk); Pervan, Pullen, Christie 1998, "A multiple hypothesis approach to
+Sources: Blanch, Walter, Enge et al. 2015, "Baseline advanced RAIM user algorithm and possible improvements" (one bound
+for all hypotheses together); Pervan, Pullen, Christie 1998, "A multiple hypothesis approach to
 satellite navigation integrity" (posterior probabilities of the hypotheses in place of a test).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from fgloc.config import IntegrityConfig
 from fgloc.estimation.landmark_modes import LandmarkModes
+from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.joint import innovation, joint_cov
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.observation import Lines
 from fgloc.types import FloatArray, Protection
 
 _INDEPENDENT_S = 10.0  # errors further apart than this are taken to be independent: so many samples has an hour
-_NOISE_SHARE = 0.5  # of the risk, for noise alone; the faults share the rest alike
+_HALVINGS = 10  # by which the bound is found to a thousandth
 # Sigma of the errors over that of the covariance, in the tail: models of noise are Gaussian, its tails are not
 _OVERBOUND = 1.3
 _DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and nobody knows
@@ -32,6 +39,69 @@ _UNBOUNDED = np.full(3, np.inf)
 _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fault:
+    """What may be wrong beside noise: the error of the pose then has a normal distribution.
+
+    Attributes:
+        name: of the cause.
+        share: its probability.
+        mean: ``(3,)`` of the error's size.
+        added: ``(3,)`` variance, beside that of the noise.
+        most: ``(3,)`` that the fault alone can make.
+    """
+
+    name: str
+    share: float
+    mean: FloatArray
+    added: FloatArray
+    most: FloatArray = field(default_factory=lambda: _UNBOUNDED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """Sightings of one step, as they corrected the predicted pose.
+
+    Attributes:
+        predicted: the pose before them.
+        known: the installation then.
+        lines: the sightings, linearized there.
+        dt: length of the step [s].
+    """
+
+    predicted: PoseWithCovariance
+    known: InstallationEstimate
+    lines: Lines
+    dt: float
+
+    def if_slipped(self, prior: float, off: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Error of the corrected pose if the wheels slipped before it, and nobody has noticed: solution separation.
+
+        Args:
+            prior: probability of that.
+            off: ``(3,)`` variance that it adds to the prediction.
+
+        Returns:
+            Probability after the sightings, mean ``(3,)`` and added variance ``(3,)`` of the error.
+        """
+        P = joint_cov(self.predicted, self.known)
+        slipped = P.copy()
+        slipped[np.arange(3), np.arange(3)] += off
+        (log_sound, sound, cov), (log_slipped, moved, wide) = self._corrected(P), self._corrected(slipped)
+        odds = math.log(max(prior, 1e-300)) - math.log1p(-min(prior, 0.5)) + log_slipped - log_sound
+        share = 1.0 / (1.0 + math.exp(-float(np.clip(odds, -700.0, 700.0))))
+        return share, moved - sound, _OVERBOUND**2 * np.maximum(wide - cov, 0.0)
+
+    def _corrected(self, P: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood of the sightings, correction ``(3,)`` of the pose and its variance ``(3,)`` after it."""
+        found = innovation(P, self.lines)
+        root = np.linalg.cholesky(found.cov)
+        white = np.linalg.solve(root, np.column_stack([found.residual, found.H @ P[:, :3]]))
+        w, gain = white[:, 0], white[:, 1:]
+        fits = -0.5 * float(w @ w) - float(np.log(np.diag(root)).sum())
+        return fits, -gain.T @ w, np.diag(P)[:3] - (gain**2).sum(axis=0)
+
+
 class ProtectionLevels:
     """Bounds on the error of each pose, by the hypotheses that the landmark modes follow."""
 
@@ -39,13 +109,22 @@ class ProtectionLevels:
         """Take the risk and the alert limits, and the hypotheses of displaced landmarks."""
         self._config, self._modes = config, modes
         samples = max(3600.0 / _INDEPENDENT_S, 1.0)
-        self._risk = config.risk_per_hour / samples / 3.0  # of a sample and axis
-        self._fastest: FloatArray = np.zeros(2)  # speed and yaw rate since the last fix
-        self._sigmas = -float(_quantile(np.array(0.5 * _NOISE_SHARE * self._risk)))
-        self._radii = float(_radius(np.array(2.0 * _NOISE_SHARE * self._risk)))
+        risk = config.risk_per_hour / samples / 3.0  # of a sample and axis; a position has that of two
+        self._fastest: FloatArray = np.zeros(2)  # speed and yaw rate since the last fix ...
+        self._blind_s = 0.0  # ... which was so long before the newest pose
+        self._risks = risk * np.array([1.0, 1.0, 1.0, 2.0])
+        self._negligible = 1e-3 * risk  # probability of a fault
+        within, around = -float(ndtri(0.5 * risk)), math.sqrt(-2.0 * math.log(2.0 * risk))
+        self._alone = np.array([within, within, within, around])  # sigmas, where there is nothing but noise
 
     def of(
-        self, cov: FloatArray, speed: FloatArray, since_fix_s: float, checked: bool, slips_per_s: float = 0.0
+        self,
+        cov: FloatArray,
+        speed: FloatArray,
+        since_fix_s: float,
+        checked: bool,
+        slips_per_s: float = 0.0,
+        fix: Fix | None = None,
     ) -> Protection:
         """Bound of the newest pose.
 
@@ -55,62 +134,86 @@ class ProtectionLevels:
             since_fix_s: time since a sighting was used.
             checked: whether wheels are compared with an independent source of motion.
             slips_per_s: slips that were found in this run: where wheels slip, some slips pass unseen.
+            fix: how sightings were used, if they were.
         """
         variance = _OVERBOUND**2 * np.diag(cov)
         widest = _OVERBOUND**2 * float(np.linalg.eigvalsh(cov[:2, :2])[-1])  # variance in the worst direction
-        names: list[str] = []
-        priors, biases, added, most = [], [], [], []  # most: that the fault alone can make
-        for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED):
-            names.append(f"landmark {landmark_id}")
-            priors.append(share)
-            biases.append(np.abs(bias))
-            added.append(spread)
-            most.append(_UNBOUNDED)
+        faults = [
+            _Fault(f"landmark {landmark_id}", share, np.abs(bias), spread)
+            for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED)
+            if share > self._negligible
+        ]
+        slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
+        if slip is not None and slip.share > self._negligible:
+            faults.append(slip)
+        sound = np.sqrt([*variance, widest])
+        bound, cause = self._least(sound, faults)
+        return Protection(bound[:3], float(bound[3]), cause, self._is_alert(float(bound[3]), float(bound[2])))
+
+    def _slip(
+        self, speed: FloatArray, since_fix_s: float, checked: bool, slips_per_s: float, fix: Fix | None
+    ) -> _Fault | None:
+        """Wheels slipped since the last fix, or before this one since the one before; None: there was no time for it.
+
+        A robot that stands now may have slipped before: the fastest motion since then counts.
+        """
         now = np.array([np.hypot(speed[0], speed[1]), abs(speed[2])])
-        self._fastest = np.maximum(self._fastest, now) if since_fix_s > 0.0 else now
-        if since_fix_s > 0.0:
-            lasts_s = min(since_fix_s, _SLIP_LASTS_S)
-            linear, turn = self._fastest.tolist()
-            turn = max(turn, _LEAST_RAD_S) if linear > 0.0 else turn
-            off = np.square([linear * lasts_s, linear * lasts_s, turn * lasts_s]) * (_CHECKED**2 if checked else 1.0)
-            expected = (_SLIP_PER_S + slips_per_s) * since_fix_s
-            names.append("slip")
-            priors.append(-math.expm1(-expected))
-            biases.append(np.zeros(3))
-            added.append(off * (1.0 + expected))
-            most.append(since_fix_s * np.array([linear, linear, turn]))
-        bound, cause = self._sigmas * np.sqrt(variance), "noise"
-        position = self._radii * math.sqrt(widest)
-        if names:
-            # An axis has a third of the risk, a position two; no direction is spread by more than the trace
-            tail = (1.0 - _NOISE_SHARE) * self._risk / len(names) / np.maximum(priors, 1e-300)
-            matters = tail < 1.0
-            sigmas, radii = -_quantile(np.minimum(0.5 * tail, 0.5)), _radius(np.minimum(2.0 * tail, 1.0))
-            off_by, spreads, far = np.array(biases) * matters[:, None], np.array(added), np.array(most)
-            noise, all_of_it = sigmas[:, None] * np.sqrt(variance), sigmas[:, None] * np.sqrt(variance + spreads)
-            each = off_by + np.minimum(all_of_it, noise + far)
-            spread = np.minimum(
-                radii * np.sqrt(widest + spreads[:, :2].sum(axis=1)), radii * np.sqrt(widest) + far[:, 0]
-            )
-            places = np.hypot(off_by[:, 0], off_by[:, 1]) + spread
-            worst = int(np.argmax(places))
-            if places[worst] > position:
-                position, cause = float(places[worst]), names[worst]
-            bound = np.maximum(bound, each.max(axis=0))
-        return Protection(bound, position, cause, self._is_alert(position, float(bound[2])))
+        self._fastest = np.maximum(self._fastest, now)
+        linear, turn = self._fastest.tolist()
+        blind_s = since_fix_s if since_fix_s > 0.0 else 0.0 if fix is None else self._blind_s + fix.dt
+        self._blind_s = since_fix_s
+        if since_fix_s == 0.0:
+            self._fastest = now
+        if blind_s == 0.0:
+            return None
+        turn = max(turn, _LEAST_RAD_S) if linear > 0.0 else turn
+        expected = (_SLIP_PER_S + slips_per_s) * blind_s
+        off = np.square(np.array([linear, linear, turn]) * min(blind_s, _SLIP_LASTS_S)) * (1.0 + expected)
+        off *= _CHECKED**2 if checked else 1.0
+        share, bias, spread = -math.expm1(-expected), np.zeros(3), off
+        if since_fix_s == 0.0 and fix is not None:
+            share, bias, spread = fix.if_slipped(share, off)
+        return _Fault("slip", share, np.abs(bias), spread, blind_s * np.array([linear, linear, turn]))
+
+    def _least(self, sound: FloatArray, faults: Sequence[_Fault]) -> tuple[FloatArray, str]:
+        """Least bounds ``(4,)`` on x, y, yaw and distance that keep the risk, and what that on the distance is due to.
+
+        Args:
+            sound: ``(4,)`` sigmas of these if nothing is wrong but noise.
+            faults: what else may be.
+        """
+        low = self._alone * sound
+        if not faults:
+            return low, "noise"
+        share = np.array([1.0, *(fault.share for fault in faults)])
+        mean, sigma, most = np.zeros((len(share), 4)), np.tile(sound, (len(share), 1)), np.zeros((len(share), 4))
+        for i, fault in enumerate(faults, 1):  # no direction is spread by more than the trace
+            mean[i] = *fault.mean, math.hypot(fault.mean[0], fault.mean[1])
+            sigma[i] = np.sqrt(sound**2 + [*fault.added, fault.added[0] + fault.added[1]])
+            most[i] = *fault.most, fault.most[0]
+
+        def beyond(bound: FloatArray) -> FloatArray:
+            """Probability of a larger error by each hypothesis, times its own ``(n, 4)``."""
+            return share[:, None] * np.minimum(_tails(bound - mean, sigma), _tails(bound - mean - most, sound))
+
+        high = low.copy()
+        while (over := beyond(high).sum(axis=0) > self._risks).any():
+            low, high = np.where(over, high, low), np.where(over, 1.5 * high, high)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            over = beyond(middle).sum(axis=0) > self._risks
+            low, high = np.where(over, middle, low), np.where(over, high, middle)
+        causes = beyond(high)[:, 3]
+        return high, ["noise", *(fault.name for fault in faults)][int(np.argmax(causes))]
 
     def _is_alert(self, position_m: float, yaw_rad: float) -> bool:
         limit, yaw = self._config.alert_m, self._config.alert_yaw_rad
         return (limit is not None and position_m > limit) or (yaw is not None and yaw_rad > yaw)
 
 
-def _quantile(probability: FloatArray) -> FloatArray:
-    """Standard normal quantile."""
-    from scipy.special import ndtri  # as in `fgloc.stats`
-
-    return np.asarray(ndtri(probability))
-
-
-def _radius(probability: FloatArray) -> FloatArray:
-    """Distance that a standard normal vector in the plane exceeds with this probability."""
-    return np.sqrt(-2.0 * np.log(probability))
+def _tails(gap: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Probability ``(n, 4)`` of larger errors by these sigmas: three of one axis, the last of a place in the plane."""
+    z = gap / sigma
+    found = 2.0 * ndtr(-z)
+    found[:, 3] = np.exp(-0.5 * np.maximum(z[:, 3], 0.0) ** 2)
+    return np.asarray(np.minimum(found, 1.0))

@@ -11,11 +11,11 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config
-from fgloc.estimation.integrity import ProtectionLevels
+from fgloc.estimation.integrity import Fix, ProtectionLevels
 from fgloc.estimation.log import JUMP, mode_decisions, place_decision, segment_decision
 from fgloc.estimation.motion import MotionJudge
 from fgloc.estimation.place import InitialPose
-from fgloc.estimation.sightings import SightingJudge
+from fgloc.estimation.sightings import JudgedSightings, SightingJudge
 from fgloc.estimation.tracking import Tracking
 from fgloc.graph.estimators import Estimator, make_estimator
 from fgloc.graph.ground import spatial
@@ -124,7 +124,7 @@ class Localizer:
             self.motion.restart()
         # 6. Record
         rows = [*motion.revisions, *seen.places, *motion.decisions(frame.k), *seen.decisions, *moved]
-        return self._recorder.record(step, frame, rows)
+        return self._recorder.record(step, frame, rows, seen)
 
     def restart_at(self, pose: PoseWithCovariance) -> None:
         """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.
@@ -338,8 +338,17 @@ class Recorder:
         """Note a new segment, to be reported with its first estimate."""
         self._clock_jumps.append(segment_decision(k, step.start_ns))
 
-    def record(self, step: Step, frame: Keyframe, decisions: Sequence[Decision]) -> Estimate:
-        """The estimate of the newest keyframe; its mode and added covariance are kept in the log for the smoother."""
+    def record(
+        self, step: Step, frame: Keyframe, decisions: Sequence[Decision], seen: JudgedSightings | None = None
+    ) -> Estimate:
+        """The estimate of the newest keyframe; its mode and added covariance are kept in the log for the smoother.
+
+        Args:
+            step: that ends at it.
+            frame: the keyframe.
+            decisions: made in this step.
+            seen: its sightings; None: it is the first keyframe after a start.
+        """
         tracking, belief = self._tracking, frame.belief
         frame.step, frame.mode = step, tracking.mode
         if self._motion.is_carried and frame.mode is Mode.OK and tracking.since_fix_s > 0.0:
@@ -361,8 +370,12 @@ class Recorder:
             pose = self._frame.place(frame.k, pose, self._estimator)
             cov = se2.rotate_cov(cov, float(self._frame.T_map_graph[2]))
         checked = self._motion.sources.is_checked(frame.readings, frame.budget.rejected)
+        fix = None
+        if seen is not None and seen.lines is not None:
+            known = seen.predicted.installation or self._estimator.installed
+            fix = Fix(seen.predicted, known, seen.lines, step.dt)
         protection = self._levels.of(
-            belief.cov + frame.added_cov, twist, tracking.since_fix_s, checked, self._motion.slips_per_s
+            belief.cov + frame.added_cov, twist, tracking.since_fix_s, checked, self._motion.slips_per_s, fix
         )
         return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground, protection)
 

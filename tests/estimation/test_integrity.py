@@ -5,9 +5,13 @@ import pytest
 from scipy.stats import norm
 
 from fgloc.config import IntegrityConfig
-from fgloc.estimation.integrity import ProtectionLevels
+from fgloc.estimation.integrity import Fix, ProtectionLevels
+from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.observation import Lines
 
 COV = np.diag([0.004, 0.003, 0.005]) ** 2
+STILL = np.zeros(3)
 REST, DRIVES = np.zeros(3), np.array([0.4, 0.0, 0.1])
 
 
@@ -70,7 +74,50 @@ def test_in_the_dark_a_slip_may_go_unseen_and_less_of_it_between_two_sources():
     fixed, dark, checked = bound(), bound(since_fix_s=5.0), bound(since_fix_s=5.0, checked=True)
     assert dark.cause == "slip"
     assert fixed.position_m < checked.position_m < dark.position_m
-    assert bound(since_fix_s=5.0, speed=REST).position_m == fixed.position_m
+    assert bound(since_fix_s=5.0, speed=REST).position_m == pytest.approx(fixed.position_m, rel=0.01)
+
+
+def test_soon_after_a_fix_a_slip_has_made_no_more_than_the_way_since_then():
+    fixed, dark = bound(), bound(since_fix_s=0.1)
+    assert dark.cause == "slip"
+    assert dark.position_m - fixed.position_m <= 0.1 * DRIVES[0]
+
+
+def test_a_robot_that_slipped_and_stands_now_is_still_off():
+    levels = ProtectionLevels(IntegrityConfig(), Modes())
+    levels.of(COV, DRIVES, 1.0, False)
+    stands = levels.of(COV, REST, 5.0, False)
+    assert stands.cause == "slip"
+    assert stands.position_m == pytest.approx(bound(since_fix_s=5.0).position_m)
+
+
+def fix_by(sigma, off_m=0.0):
+    """One sighting of the whole pose, so far from the prediction [m], ahead."""
+    residual = np.array([-off_m, 0.0, 0.0]) / sigma
+    lines = Lines(residual, np.eye(3) / sigma, np.zeros((3, 0)), [3], np.array([False]))
+    return Fix(PoseWithCovariance(STILL, COV), InstallationEstimate(np.zeros(0), np.zeros((0, 0))), lines, 0.5)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.01])
+def test_a_fix_that_differs_from_the_prediction_may_be_of_a_robot_that_slipped(off_m):
+    """By the two solutions, with and without the prediction, in one dimension."""
+    prior, off, sigma = 0.1, np.array([0.2, 0.2, 0.3]) ** 2, 0.01
+    share, mean, added = fix_by(sigma, off_m).if_slipped(prior, off)
+    P = np.diag(COV)
+    gains = [p / (p + sigma**2) for p in (P, P + off)]
+    assert mean == pytest.approx((gains[1] - gains[0]) * [off_m, 0.0, 0.0])
+    assert added == pytest.approx(1.3**2 * ((1.0 - gains[1]) * (P + off) - (1.0 - gains[0]) * P))
+    at = np.array([off_m, 0.0, 0.0])
+    ratio = np.prod(norm.pdf(at, scale=np.sqrt(P + off + sigma**2)) / norm.pdf(at, scale=np.sqrt(P + sigma**2)))
+    assert share == pytest.approx(prior * ratio / (1.0 - prior + prior * ratio))
+
+
+def test_at_a_fix_that_is_hardly_better_than_the_prediction_a_slip_is_a_cause():
+    levels = ProtectionLevels(IntegrityConfig(), Modes())
+    levels.of(COV, DRIVES, 0.5, False)
+    found = levels.of(COV, DRIVES, 0.0, False, 0.05, fix_by(0.02, 0.03))
+    assert found.cause == "slip"
+    assert found.position_m > bound().position_m
 
 
 def test_an_alert_is_given_above_the_limit_of_position_or_yaw():
