@@ -1,9 +1,10 @@
 """Protection levels: bounds that the error of a pose exceeds with no more than a stated risk, also if a sensor lies.
 
 What may be wrong is a list of hypotheses, each with a prior: nothing but noise; one landmark displaced; wheels that
-slipped since the last fix, or just before it. Under each the error of the pose has a normal distribution: the landmark modes follow, beside
-the estimator, how a displacement that has not been found out moves the pose and how likely it still is. The bound is
-the least one that keeps the probability of a larger error, over all hypotheses together, within the risk.
+slipped since the last fix, or just before it. Under each the error of the pose has a normal distribution: the landmark
+modes follow, beside the estimator, how a displacement that has not been found out moves the pose and how likely it
+still is. The bound is the least one that keeps the probability of a larger error, over all hypotheses together, within
+the risk.
 
 Sources: Blanch, Walter, Enge et al. 2015, "Baseline advanced RAIM user algorithm and possible improvements" (one bound
 for all hypotheses together); Pervan, Pullen, Christie 1998, "A multiple hypothesis approach to

@@ -10,7 +10,7 @@ import pytest
 from robot_world import START_NS, Chain, World, config, position_error, room, standing
 
 from fgloc.sensors.markers.images import CornersEvent
-from fgloc.types import Landmark
+from fgloc.types import Landmark, LandmarkMap
 
 SHARE = 0.4
 
@@ -73,3 +73,19 @@ def test_a_robot_that_was_carried_away_is_found_among_misread_markers(seed):
 def test_sound_markers_are_not_read_again():
     _, estimates = follow(room(), World(room(), seed=2, seconds=8.0).events())
     assert not any(d.reason == "misread" for e in estimates for d in e.decisions)
+
+
+@pytest.mark.parametrize(("images", "moves"), [(1, False), (3, True)])
+def test_two_markers_in_a_row_that_are_misread_alike_move_no_robot_but_if_they_are_again(images, moves):
+    """Every second marker of the row hangs as far from the next: their ids fit another place as well."""
+    row = LandmarkMap({i: hanging(i, 0.5 * i - 3.0) for i in range(13)})
+    made, left = [], images
+    for event in World(row, seed=3, seconds=4.0).events():
+        if isinstance(event, CornersEvent):
+            seen = event.sightings[:2]
+            if event.stamp_ns > START_NS + 2 * 10**9 and left and len(seen) == 2:
+                left, seen = left - 1, [replace(s, landmark_id=s.landmark_id - 4) for s in seen]
+            event = replace(event, sightings=tuple(seen))
+        made.append(event)
+    _, estimates = follow(row, made)
+    assert any(d.reason == "jump" for e in estimates for d in e.decisions) == moves
