@@ -164,7 +164,7 @@ def _bare(solver: BatchSmoother, factors: LandmarkFactors) -> dict[str, float]:
     added_s += _added(graph, [gtsam.PriorFactorVector(INSTALLATION, prior.mean, noise)])
     for frame, pose in zip(frames, poses, strict=True):
         if frame.sightings:
-            lines = factors.observe([s.measurement for s in frame.sightings]).linearize(pose, theta)
+            lines = factors.observe([s.measurement for s in frame.sightings]).together(pose, theta)
             added_s += _added(graph, sighting_factors(frame.k, frame.sightings, lines, pose, theta))
     ours = elimination_order(frames, factors.installation.constants)
     orders: dict[str, gtsam.Ordering | None] = {"gtsam": None, "ordered": ours}

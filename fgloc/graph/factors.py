@@ -21,7 +21,7 @@ from fgloc.frames import rotations
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
-from fgloc.graph.observation import Linearized, Lines, Observations
+from fgloc.graph.observation import Lines, Observations
 from fgloc.sensors.measurements import FrameMeasurement, LandmarkMeasurement, PointMeasurement
 from fgloc.types import (
     FloatArray,
@@ -297,11 +297,6 @@ class LandmarkFactors:
             held = {id(m): (m, i) for i, m in enumerate(measurements)}
             self._remembered = pose, held, lines
         return lines.only([held[id(m)][1] for m in measurements])
-
-    def whitening(self, one: Linearized) -> FloatArray:
-        """``(d, d)`` that makes the residual white, installation included as if it were noise."""
-        cov = one.noise() + one.H @ self.estimated.cov[np.ix_(one.columns, one.columns)] @ one.H.T
-        return sighting_whitening(cov)
 
     def lookalikes(self, m: LandmarkMeasurement, pose: FloatArray) -> Sequence[LandmarkMeasurement]:
         """The sighting as one of another marker of the same size, seen from this pose about where this one was seen.

@@ -22,7 +22,7 @@ from fgloc.sensors.measurements import (
     PointMeasurement,
     PoseMeasurement,
 )
-from fgloc.types import FloatArray, IntArray, Landmark
+from fgloc.types import Camera, FloatArray, IntArray, Landmark
 
 # --- Residuals and Jacobians ------------------------------------------------------------------------------------------
 
@@ -164,6 +164,7 @@ class Lines:
 
 _BLURRED_SIDE_PX = 20.0  # side of a marker that shrinks by as much as its corners are off; falls with the square
 _MOST_BLURRED = 2.0
+_BEYOND_EDGE = 2.0  # of the squared radius of the image's corner, by which a lens may have drawn that in
 
 
 class CornerBatch:
@@ -190,6 +191,7 @@ class CornerBatch:
         self._R, self._t = T[:, :3, :3], T[:, :3, 3]
         self._K = np.array([camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras.values()])[of]
         self._D = np.array([np.concatenate([camera.D, np.zeros(4)])[:4] for camera in cameras.values()])[of]
+        self._widest = np.array([_widest(camera) for camera in cameras.values()])[of]
         self._pixels = np.array([m.corners_px for m in seen])
         self._sigma = np.array([m.sigma_px for m in seen])
         self._twist = np.array([m.twist for m in seen])
@@ -317,14 +319,15 @@ class CornerBatch:
         x, y = X[:, :, 0] / Z, X[:, :, 1] / Z
         k1, k2 = self._D[:, None, 0] + camera[:, None, 9], self._D[:, None, 1] + camera[:, None, 10]
         p1, p2 = self._D[:, None, 2], self._D[:, None, 3]
-        r2 = x * x + y * y
+        whole = x * x + y * y
+        r2 = np.minimum(whole, self._widest[:, None])
         radial = 1.0 + k1 * r2 + k2 * r2 * r2
-        xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        xd = x * radial + 2.0 * p1 * x * y + p2 * (whole + 2.0 * x * x)
+        yd = y * radial + p1 * (whole + 2.0 * y * y) + 2.0 * p2 * x * y
         f = self._K[:, None, :2] * (1.0 + camera[:, None, 6:7])
         image = np.stack([xd, yd], axis=2)
         predicted = f * image + self._K[:, None, 2:] + camera[:, None, 7:9]
-        dr = k1 + 2.0 * k2 * r2
+        dr = (k1 + 2.0 * k2 * r2) * (whole <= self._widest[:, None])
         by_ray = np.empty((len(X), 4, 2, 2))
         by_ray[..., 0, 0] = radial + 2.0 * x * x * dr + 2.0 * p1 * y + 6.0 * p2 * x
         by_ray[..., 0, 1] = by_ray[..., 1, 0] = 2.0 * x * y * dr + 2.0 * p1 * x + 2.0 * p2 * y
@@ -376,6 +379,17 @@ class CornerBatch:
         if moved is not None:
             common.append(stack.J[i, :, :3] @ moved)
         return np.hstack(common)
+
+
+def _widest(camera: Camera) -> float:
+    """Squared tangent of the angle from the optical axis up to which the lens distorts more and more.
+
+    Beyond the image its polynomial means nothing, and grows without bound: a marker with a wrong id that is expected
+    beside the camera would agree with everything, and make the lens known exactly. There the edge's distortion holds.
+    """
+    fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    x, y = max(cx, camera.width - cx) / fx, max(cy, camera.height - cy) / fy
+    return float(_BEYOND_EDGE * (x * x + y * y))
 
 
 def _map_base(poses: FloatArray) -> tuple[FloatArray, FloatArray | None]:

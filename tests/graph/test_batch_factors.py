@@ -58,7 +58,7 @@ def test_sightings_and_the_prior_of_the_installation(run):
     one_by_one = [gtsam.PriorFactorVector(INSTALLATION, prior.mean, gtsam.noiseModel.Gaussian.Covariance(prior.cov))]
     for frame, pose in zip(frames, poses, strict=True):
         if frame.sightings:
-            lines = factors.observe([s.measurement for s in frame.sightings]).linearize(pose, theta)
+            lines = factors.observe([s.measurement for s in frame.sightings]).together(pose, theta)
             one_by_one += sighting_factors(frame.k, frame.sightings, lines, pose, theta)
     assert len(one_by_one) > 50
     sightings = BatchSightings(frames, [frame.sightings for frame in frames], factors)

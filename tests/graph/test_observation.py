@@ -11,7 +11,6 @@ from exact import exact
 from robot_world import config, standing
 
 from fgloc import se2
-from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import CAMERA, MARKER, PLACE, SENSOR, Installation, installation_of
 from fgloc.graph.noise import sighting_whitening
 from fgloc.graph.observation import MIN_DEPTH_M, Observations
@@ -242,14 +241,19 @@ def test_sightings_of_several_kinds_come_back_in_their_order():
         assert a.residual == pytest.approx(b.residual, abs=1e-12)
 
 
-def test_whitening_makes_unit_noise_of_residual_and_installation():
-    poses, landmark_map, seen = scene(1, n=1)
-    factors = LandmarkFactors(landmark_map, installation_of(config(), landmark_map, True))
-    (one,) = factors.linearize(seen, poses[0])
-    W = factors.whitening(one)
-    sigmas = factors.installation.sigmas[one.columns]
-    cov = one.noise() + one.H @ np.diag(sigmas**2) @ one.H.T
-    assert W @ cov @ W.T == pytest.approx(np.eye(8), abs=1e-9)
+def test_beside_the_camera_the_lens_distorts_no_more_than_at_the_edge_of_its_images():
+    """Where a wrong id puts a marker there, its corners would agree with everything, by coefficients to any power."""
+    T_base_cam = np.eye(4)
+    T_base_cam[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    camera = Camera(640, 480, "plumb_bob", K, np.array([0.1, 0.05, 0.0, 0.0]), T_base_cam)
+    place = np.array([0.3, 3.0, 0.5])  # 84 degrees to the left
+    aside = Landmark(0, place, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), 0.2)
+    installation = Installation({f"camera.{name}": 0.005 for name in CAMERA})
+    seen = [PixelMeasurement(0, 0, np.array([[300.0, 220], [340, 220], [340, 260], [300, 260]]), 0.5, camera)]
+    lines = Observations(seen, {0: aside}, installation).together(np.zeros(3), np.zeros(len(installation)))
+    assert not lines.behind.any()
+    by_k2 = lines.H[:, 3 + installation.index["camera.k2"]]
+    assert np.abs(lines.residual).max() > 100.0 * np.abs(0.005 * by_k2).max()
 
 
 def test_whitening_survives_a_covariance_that_rounding_has_corrupted():
