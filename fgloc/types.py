@@ -473,7 +473,7 @@ class Protection:
     Attributes:
         bound: ``(3,)`` along and across the robot [m], and of the yaw [rad].
         position_m: on the distance from the true place [m]; less than along and across together.
-        cause: what the bound is due to: "noise", "landmark 7" (displaced), "slip".
+        cause: what the bound is due to: "noise", "landmark 7" (displaced), "slip", "place" (a jump to it).
         alert: whether it is above the alert limit.
     """
 

@@ -39,6 +39,7 @@ from fgloc.types import (
     LandmarkMap,
     Mode,
     MotionMeasurement,
+    Protection,
     Severity,
     Step,
     Trajectory,
@@ -659,6 +660,10 @@ class _Edge:
     path: float
 
 
+NO_BOUND = Protection(np.full(3, np.inf), math.inf, "odometry", alert=True)
+"""Of the odometry in place of an estimate: nothing is known of how far it may be off."""
+
+
 class Watch:
     """Holds the estimate against the odometry while a run goes on; gives the odometry where the estimate fails.
 
@@ -732,7 +737,8 @@ class Watch:
         self._given = pose
         turned = se2.rotate_cov(cov, float(pose[2]))
         ground = None if estimate.ground is None else estimate.ground.with_planar(turned)
-        return replace(estimate, pose=pose, cov=turned, mode=Mode.DEAD_RECKONING, ground=ground)
+        bound = None if estimate.protection is None else NO_BOUND
+        return replace(estimate, pose=pose, cov=turned, mode=Mode.DEAD_RECKONING, ground=ground, protection=bound)
 
     @property
     def sentence(self) -> str | None:

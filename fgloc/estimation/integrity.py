@@ -36,6 +36,10 @@ _DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and 
 _SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second, beside as many as they do show ...
 _SLIP_LASTS_S = 1.0  # ... each at most so long, at the speed of the wheels
 _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
+_WRONG_JUMP = 1e-2  # probability that a place to which the estimate jumps is wrong ...
+_BY_ACCIDENT = 0.1  # ... and that a sighting agrees with it nevertheless
+_LONG_AGO = 100
+_ELSEWHERE = np.square([10.0, 10.0, 1.8])  # m², m², rad²
 _UNBOUNDED = np.full(3, np.inf)
 _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
 
@@ -112,11 +116,16 @@ class ProtectionLevels:
         samples = max(3600.0 / _INDEPENDENT_S, 1.0)
         risk = config.risk_per_hour / samples / 3.0  # of a sample and axis; a position has that of two
         self._fastest: FloatArray = np.zeros(2)  # speed and yaw rate since the last fix ...
+        self._agreeing = _LONG_AGO  # sightings since the robot was found at another place
         self._blind_s = 0.0  # ... which was so long before the newest pose
         self._risks = risk * np.array([1.0, 1.0, 1.0, 2.0])
         self._negligible = 1e-3 * risk  # probability of a fault
         within, around = -float(ndtri(0.5 * risk)), math.sqrt(-2.0 * math.log(2.0 * risk))
         self._alone = np.array([within, within, within, around])  # sigmas, where there is nothing but noise
+
+    def jumped(self) -> None:
+        """The robot was found at another place: misread markers agree on one now and then."""
+        self._agreeing = 0
 
     def of(
         self,
@@ -147,6 +156,9 @@ class ProtectionLevels:
         slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
         if slip is not None and slip.share > self._negligible:
             faults.append(slip)
+        self._agreeing += 0 if fix is None else len(fix.lines)
+        if (share := _WRONG_JUMP * _BY_ACCIDENT**self._agreeing) > self._negligible:
+            faults.append(_Fault("place", share, np.zeros(3), _ELSEWHERE))
         sound = np.sqrt([*variance, widest])
         bound, cause = self._least(sound, faults)
         return Protection(bound[:3], float(bound[3]), cause, self._is_alert(float(bound[3]), float(bound[2])))

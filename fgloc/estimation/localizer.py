@@ -196,7 +196,7 @@ class Localizer:
             self.tracking.found(before, place)
         self.motion.restart()
         self.sightings.restart()
-        self._recorder.rejections["motion.jump"] += 1
+        self._recorder.jumped()
         decisions = [*decisions, *self.sightings.exclude_displaced(self.estimator.k + 1, step, found)]
         estimate = self._start(step, place, ())
         return replace(estimate, decisions=(*decisions, *estimate.decisions))
@@ -333,6 +333,11 @@ class Recorder:
         self.counts.update(() if frame.prior is None else ("prior",))
         self.counts.update(m.source for m in frame.motions)
         self.counts.update(s.measurement.row_kind for s in frame.sightings)
+
+    def jumped(self) -> None:
+        """Count that the robot was found at another place; its next bounds allow for an error in that."""
+        self.rejections["motion.jump"] += 1
+        self._levels.jumped()
 
     def clock_jumped(self, k: int, step: Step) -> None:
         """Note a new segment, to be reported with its first estimate."""

@@ -16,7 +16,7 @@ from fgloc.errors import FglocError
 from fgloc.estimation.localizer import Localizer
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.runner import run
-from fgloc.types import Estimate, Mode, MotionMeasurement, Severity, Step
+from fgloc.types import Estimate, Mode, MotionMeasurement, Protection, Severity, Step
 from fgloc_datasets.bag import BagWriter
 
 SECOND = 1_000_000_000
@@ -159,7 +159,8 @@ def watched(poses, given, motions, away=None, mapped=True):
         stamp = T0 + k * TICK_NS
         step = Step(k, 0, stamp - TICK_NS, stamp)
         measured = MotionMeasurement("wheels", step.start_ns, stamp, motions[k], STEP_COV)
-        estimate = Estimate(stamp, given[k], np.eye(3) * 1e-4)
+        bound = Protection(np.full(3, 0.05), 0.05, "noise")
+        estimate = Estimate(stamp, given[k], np.eye(3) * 1e-4, protection=bound)
         out.append(watch.checked(step, measured, k > 0, estimate, [] if away is None else away[k]))
     return watch, out
 
@@ -179,6 +180,8 @@ def test_a_watch_carries_the_last_sane_pose_on_and_ends_when_the_estimate_is_san
     off = np.array([math.hypot(*(e.pose - p)[:2]) for e, p in zip(out, poses, strict=True)])
     assert off.max() < 0.5
     assert {e.mode for e in out[200:215]} == {Mode.DEAD_RECKONING}
+    assert all(e.protection.alert and e.protection.position_m == math.inf for e in out[200:215])
+    assert not out[199].protection.alert
     assert np.trace(out[214].cov) > np.trace(out[201].cov)
     assert [f.code for f in watch.findings()] == ["sanity.odometry"]
 

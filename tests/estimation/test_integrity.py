@@ -126,3 +126,14 @@ def test_an_alert_is_given_above_the_limit_of_position_or_yaw():
     assert bound(alert_m=0.9 * position).alert
     assert not bound(alert_m=1.1 * position).alert
     assert bound(alert_m=1.1 * position, alert_yaw_rad=0.9 * yaw).alert
+
+
+def test_a_place_found_anew_is_believed_once_enough_sightings_agree_with_it():
+    levels = ProtectionLevels(IntegrityConfig(alert_m=0.1), Modes())
+    levels.jumped()
+    bounds = [levels.of(COV, REST, 0.0, False, fix=fix_by(0.02)) for _ in range(12)]
+    assert bounds[0].cause == "place"
+    assert bounds[0].position_m > 10.0
+    assert bounds[0].alert
+    assert bounds[-1].cause == "noise"
+    assert not bounds[-1].alert
