@@ -63,7 +63,7 @@ def whitening_of(cov: FloatArray) -> FloatArray:
     try:
         if not np.isfinite(cov).all():
             raise np.linalg.LinAlgError("not finite")
-        return _inverse_root(cov)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
     except np.linalg.LinAlgError as error:
         raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: {error}") from error
 
