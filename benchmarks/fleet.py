@@ -217,7 +217,7 @@ class _Eye:
         self._normals = np.array([one.rotation[:, 2] for one in held])
 
     def image(self, tick: int, stamp: int, noise: float) -> CornersEvent:
-        """What is found in the image of a tick; its stamp is later than the exposure."""
+        """Markers found in the image of a tick; its stamp is off by as much as the clock of the camera."""
         at = min(max(tick - self._late_s / _TICK_S, 0.0), len(self._drive.truth) - 1.0)
         x, y, yaw = self._drive.true_pose(START_NS + round(at * _TICK_S * 1e9))
         c, s = math.cos(yaw), math.sin(yaw)

@@ -661,7 +661,7 @@ class _Edge:
 
 
 NO_BOUND = Protection(np.full(3, np.inf), math.inf, "odometry", alert=True)
-"""Of the odometry in place of an estimate: nothing is known of how far it may be off."""
+"""Protection level of odometry given in place of an estimate: infinite, with an alert."""
 
 
 class Watch:

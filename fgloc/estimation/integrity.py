@@ -46,7 +46,7 @@ _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fault:
-    """What may be wrong beside noise: the error of the pose then has a normal distribution.
+    """Fault hypothesis: something is wrong beside noise, and the error of the pose has another normal distribution.
 
     Attributes:
         name: of the cause.
@@ -90,21 +90,34 @@ class Fix:
             Probability after the sightings, mean ``(3,)`` and added variance ``(3,)`` of the error.
         """
         P = joint_cov(self.predicted, self.known)
-        slipped = P.copy()
-        slipped[np.arange(3), np.arange(3)] += off
-        (log_sound, sound, cov), (log_slipped, moved, wide) = self._corrected(P), self._corrected(slipped)
+        found = innovation(P, self.lines)
+        H = found.H[:, :3]
+        cross, variance = found.H @ P[:, :3], np.diag(P)[:3]
+        log_sound, sound, cov = _corrected(found.residual, found.cov, cross, variance)
+        log_slipped, moved, wide = _corrected(
+            found.residual, found.cov + (H * off) @ H.T, cross + H * off, variance + off
+        )
         odds = math.log(max(prior, 1e-300)) - math.log1p(-min(prior, 0.5)) + log_slipped - log_sound
         share = 1.0 / (1.0 + math.exp(-float(np.clip(odds, -700.0, 700.0))))
         return share, moved - sound, _OVERBOUND**2 * np.maximum(wide - cov, 0.0)
 
-    def _corrected(self, P: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood of the sightings, correction ``(3,)`` of the pose and its variance ``(3,)`` after it."""
-        found = innovation(P, self.lines)
-        root = np.linalg.cholesky(found.cov)
-        white = np.linalg.solve(root, np.column_stack([found.residual, found.H @ P[:, :3]]))
-        w, gain = white[:, 0], white[:, 1:]
-        fits = -0.5 * float(w @ w) - float(np.log(np.diag(root)).sum())
-        return fits, -gain.T @ w, np.diag(P)[:3] - (gain**2).sum(axis=0)
+
+def _corrected(
+    residual: FloatArray, cov: FloatArray, cross: FloatArray, variance: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Log-likelihood of an innovation, the correction ``(3,)`` of the pose, and the pose's variance ``(3,)`` after it.
+
+    Args:
+        residual: ``(d,)``.
+        cov: ``(d, d)`` of it.
+        cross: ``(d, 3)`` covariance of it and the pose.
+        variance: ``(3,)`` of the pose before.
+    """
+    root = np.linalg.cholesky(cov)
+    white = np.linalg.solve(root, np.column_stack([residual, cross]))
+    w, gain = white[:, 0], white[:, 1:]
+    fits = -0.5 * float(w @ w) - float(np.log(np.diag(root)).sum())
+    return fits, -gain.T @ w, variance - (gain**2).sum(axis=0)
 
 
 class ProtectionLevels:

@@ -78,19 +78,11 @@ def sighting_whitening(cov: FloatArray) -> FloatArray:
     """
     if not np.isfinite(cov).all():
         raise CovarianceError(f"a covariance of diagonal {np.diag(cov).tolist()} is none: not finite")
-    try:
-        return _inverse_root(cov)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(cov)
-        return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))).T)
-
-
-def _inverse_root(cov: FloatArray) -> FloatArray:
-    """Lower triangular W with ``Wᵀ W`` the inverse of a covariance; raises ``LinAlgError`` if it is none."""
     root, failed = dpotrf(cov, lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError("not positive definite")
-    return np.asarray(dtrtri(root, lower=1)[0])
+    if not failed:
+        return np.asarray(dtrtri(root, lower=1)[0])
+    values, vectors = np.linalg.eigh(cov)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))).T)
 
 
 def covariance_problem(cov: FloatArray) -> str:

@@ -117,7 +117,7 @@ def test_a_robot_that_stands_before_a_sensor_without_noise_repeats_itself(world)
 
 
 def test_a_recording_that_is_played_again_is_no_copy(world):
-    """As `ros2 bag play --loop`: the same stamps, received later."""
+    """Events of a bag that is played twice, as by `ros2 bag play --loop`: the same stamps, received later."""
     events = [e for e in world.events() if e.stamp_ns < START_NS + 6 * SECOND]
     with live_in(world) as live:
         made = feed(live, [*events, *(received(e, 6.0) for e in events)])
