@@ -5,6 +5,7 @@ import json
 import os
 import pty
 import re
+import select
 import shlex
 import signal
 import subprocess
@@ -312,18 +313,29 @@ def write_joints(path):
 
 
 def at_a_terminal(answers, *arguments):
-    """Exit code and output of a command whose input, output and errors are a terminal, with a line for each prompt."""
+    """Exit code and output of a command whose input, output and errors are a terminal, with a line for each prompt.
+
+    Python hears no signal between the prompt and its wait for a line (13 of 300 under load): Ctrl-C is pressed again.
+    """
     pid, terminal = pty.fork()
     if pid == 0:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background job ignores it
         os.execv(sys.executable, [sys.executable, "-m", "fgloc.cli", *map(str, arguments)])
-    out, answers = b"", [*answers]
+    out, answers, given, quiet_s = b"", [*answers], b"", 0
     with contextlib.suppress(OSError):  # the terminal is closed at the end
-        while data := os.read(terminal, 4096):
+        while quiet_s < 60:
+            if not select.select([terminal], [], [], 1.0)[0]:
+                quiet_s += 1
+                if given == b"\x03":
+                    os.write(terminal, given)
+                continue
+            data, quiet_s = os.read(terminal, 4096), 0
             out += data
             if answers and out.endswith(b"]: "):
-                os.write(terminal, answers.pop(0).encode())
+                given = answers.pop(0).encode()
+                os.write(terminal, given)
                 out += b"<"
+        os.kill(pid, signal.SIGKILL)
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), out.decode()
 
 
