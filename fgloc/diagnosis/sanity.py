@@ -214,8 +214,7 @@ class Sanity:
                 self._seen_ns.append(stamp_ns)
                 self._ids.append(landmark_id)
                 self._seen.extend((place[0], place[1], sigma))
-        away = [] if estimate is None else list(self._away(step, estimate, seen))
-        return self.watch.checked(step, measured, joined, estimate, away)
+        return self.watch.checked(step, measured, joined, estimate, list(self._mapped(step, seen)))
 
     def begin_anew(self) -> None:
         """Restart the comparison at the next pose: it was given, and the odometry does not lead there."""
@@ -234,19 +233,16 @@ class Sanity:
                 sigma = math.hypot(sighting.sigma_m, sighting.sigma_rad * math.hypot(place[0], place[1]))
                 yield event.stamp_ns, sighting.landmark_id, place, sigma
 
-    def _away(
-        self, step: Step, estimate: Estimate, seen: Sequence[tuple[int, int, FloatArray, float]]
-    ) -> Iterator[float]:
-        """Whitened distances of sightings from their landmarks of a known map, by the estimate."""
+    def _mapped(self, step: Step, seen: Sequence[tuple[int, int, FloatArray, float]]) -> Iterator[Placed]:
+        """Sightings of landmarks of a known map, in the base frame at the step's stamp."""
         if self._landmarks is None:
             return
         for stamp_ns, landmark_id, place, sigma in seen:
             if landmark_id in self._landmarks:
-                pose = estimate.pose
                 if stamp_ns != step.stamp_ns:
-                    pose = se2.compose(pose, self._wheels.motion_between(step, step.stamp_ns, stamp_ns)[0])
-                x, y = se2.compose(pose, (*place, 0.0))[:2] - self._landmarks[landmark_id]
-                yield math.hypot(x, y) / sigma
+                    motion = self._wheels.motion_between(step, step.stamp_ns, stamp_ns)[0]
+                    place = se2.compose(motion, (*place, 0.0))[:2]
+                yield Placed(place, self._landmarks[landmark_id], sigma)
 
     def judge(self, estimates: Sequence[Estimate], causal: bool = False, held: bool = False) -> Verdict:
         """Compare the run's trajectory with the simpler ones.
@@ -650,6 +646,34 @@ def laid_onto(track: Track, odometry: FloatArray, first: FloatArray) -> FloatArr
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A sighting of a surveyed landmark.
+
+    Attributes:
+        place: ``(2,)`` in the base frame at the stamp of its step [m].
+        landmark: ``(2,)`` in the map.
+        sigma: [m].
+    """
+
+    place: FloatArray
+    landmark: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Compared:
+    """A sighting as it is remembered: its place in the frame in which the odometry began, and how far the estimate was.
+
+    ``away`` is the whitened distance from its landmark.
+    """
+
+    stamp_ns: int
+    by_odometry: FloatArray
+    seen: Placed
+    away: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Edge:
     """Between two windows: time, the estimate, and the odometry from there on to the next edge."""
 
@@ -680,7 +704,8 @@ class Watch:
         self._mapped, self._config = mapped, config
         self._edges: deque[_Edge] = deque(maxlen=_WATCHED)  # with what was driven from each to the next
         self._windows: deque[Window | None] = deque(maxlen=_WATCHED)  # one for each edge; None: in rest
-        self._away: deque[tuple[int, float]] = deque(maxlen=_MOST_WATCHED)
+        self._seen: deque[_Compared] = deque(maxlen=_MOST_WATCHED)
+        self._odometry = np.zeros(3)  # from where it began
         self._start: Estimate | None = None  # of the window that is not complete, and what was driven since
         self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
         self._carried: tuple[FloatArray, FloatArray] | None = None  # pose and covariance, right perturbation
@@ -696,7 +721,7 @@ class Watch:
         measured: MotionMeasurement,
         joined: bool,
         estimate: Estimate | None,
-        away: Sequence[float],
+        seen: Sequence[Placed],
     ) -> Estimate | None:
         """The estimate, or the odometry in its place.
 
@@ -705,7 +730,7 @@ class Watch:
             measured: its odometry.
             joined: it goes on from the step before.
             estimate: None: no pose is known; the comparison begins anew.
-            away: whitened distances of the step's sightings from their landmarks.
+            seen: sightings of the step; none without a surveyed map.
         """
         if estimate is None or not joined:
             self._restart(estimate)
@@ -717,10 +742,13 @@ class Watch:
             cov = se2.compose_cov(cov, measured.motion, measured.cov * _CONTRADICTED**2)
             self._carried = se2.compose(pose, measured.motion), cov
         finite = bool(np.isfinite(estimate.pose).all() and np.isfinite(estimate.cov).all())
+        self._odometry = se2.compose(self._odometry, measured.motion)
         self._predicted = None if self._given is None else se2.compose(self._given, measured.motion)
         self._given = estimate.pose
         self._drive(step, measured, estimate, finite)
-        self._away.extend((step.stamp_ns, distance) for distance in away)
+        for one in seen:
+            away = math.hypot(*(se2.placed(estimate.pose, one.place) - one.landmark)) / one.sigma
+            self._seen.append(_Compared(step.stamp_ns, se2.placed(self._odometry, one.place), one, away))
         why = self._failure(step, estimate, finite)
         if why is None and not self._returned(estimate):
             why = self._why
@@ -758,7 +786,8 @@ class Watch:
     def _restart(self, estimate: Estimate | None) -> None:
         self._edges.clear()
         self._windows.clear()
-        self._away.clear()
+        self._seen.clear()
+        self._odometry = np.zeros(3)
         self._start, self._carried = estimate, None
         self._given = None if estimate is None else estimate.pose
         self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
@@ -788,13 +817,13 @@ class Watch:
         if estimate.mode is Mode.LOST:  # it says so itself, and sightings of another place are no surprise
             return None
         since_ns = step.stamp_ns - round(_SEEN_S * 1e9)
-        while self._away and self._away[0][0] < since_ns:
-            self._away.popleft()
+        while self._seen and self._seen[0].stamp_ns < since_ns:
+            self._seen.popleft()
         explained = math.nan
-        if len(self._away) >= _SIGHTINGS and (self._away[-1][0] - self._away[0][0]) * 1e-9 > 0.5 * _SEEN_S:
-            away = np.array([distance for _, distance in self._away])
+        if len(self._seen) >= _SIGHTINGS and (self._seen[-1].stamp_ns - self._seen[0].stamp_ns) * 1e-9 > 0.5 * _SEEN_S:
+            away = np.array([one.away for one in self._seen])
             explained = float(np.mean(away < _EXPLAINED))
-            if not supported(explained, float(np.median(away))):
+            if not supported(explained, float(np.median(away))) and self._by_odometry() > explained - _MORE:
                 return f"it explains {_percent(explained)} of the sightings of {_SEEN_S:.0f} s"
         moving = [w for w in self._windows if w is not None]
         if not self._mapped and self._predicted is not None:
@@ -808,6 +837,16 @@ class Watch:
         if departs(departure, strain, self._mapped):
             return f"over {len(moving)} windows of {_WINDOW_S:.0f} s it departs by {_percent(departure)} of the path"
         return None
+
+    def _by_odometry(self) -> float:
+        """Share of the sightings that the odometry explains which would be given in place of the estimate."""
+        carried = self._carried or self._last_sane()
+        if carried is None:
+            return 0.0
+        T = se2.compose(carried[0], se2.inverse(self._odometry))
+        places = se2.placed(T, np.array([one.by_odometry for one in self._seen]))
+        off = places - np.array([one.seen.landmark for one in self._seen])
+        return float(np.mean(np.hypot(*off.T) < _EXPLAINED * np.array([one.seen.sigma for one in self._seen])))
 
     def _returned(self, estimate: Estimate) -> bool:
         """Whether an estimate that has failed can be given again; without a map it must be near the odometry."""

@@ -11,7 +11,7 @@ import pytest
 from fgloc import se2
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, config_of
-from fgloc.diagnosis.sanity import Track, Watch, gyro_agrees, judged
+from fgloc.diagnosis.sanity import Placed, Track, Watch, gyro_agrees, judged
 from fgloc.errors import FglocError
 from fgloc.estimation.localizer import Localizer
 from fgloc.evaluation.metrics import compute_metrics
@@ -152,8 +152,8 @@ def test_odometry_in_place_of_the_estimate_has_an_honest_covariance():
     assert 0.02 < np.mean(nees) < 2.0
 
 
-def watched(poses, given, motions, away=None, mapped=True):
-    """Estimates that a watch returns, one for each step."""
+def watched(poses, given, motions, seen=None, mapped=True):
+    """Estimates that a watch returns, one for each step; ``seen``: of each step."""
     watch, out = Watch(mapped, Config()), []
     for k in range(len(poses)):
         stamp = T0 + k * TICK_NS
@@ -161,7 +161,7 @@ def watched(poses, given, motions, away=None, mapped=True):
         measured = MotionMeasurement("wheels", step.start_ns, stamp, motions[k], STEP_COV)
         bound = Protection(np.full(3, 0.05), 0.05, "noise")
         estimate = Estimate(stamp, given[k], np.eye(3) * 1e-4, protection=bound)
-        out.append(watch.checked(step, measured, k > 0, estimate, [] if away is None else away[k]))
+        out.append(watch.checked(step, measured, k > 0, estimate, [] if seen is None else seen[k]))
     return watch, out
 
 
@@ -195,12 +195,36 @@ def test_a_watch_is_causal():
     assert all(np.array_equal(a.pose, b.pose) for a, b in zip(whole[:250], part, strict=True))
 
 
-def test_a_watch_does_not_believe_sightings_that_the_estimate_does_not_explain():
+def seen_from(poses, landmark=(5.0, 4.0), off=(0.0, 0.0)):
+    """One sighting of a landmark by each pose; ``off`` from where it is."""
+    places = [se2.placed(se2.inverse(pose), np.array(landmark)) + off for pose in poses]
+    return [[Placed(place, np.array(landmark), 0.05)] for place in places]
+
+
+def test_a_watch_gives_the_odometry_where_it_explains_the_sightings_and_the_estimate_does_not():
     poses, motions, _ = driven()
     given = poses + np.linspace(0.0, 5.0, len(poses))[:, None] * [1.0, 0.0, 0.0]
-    watch, out = watched(poses, given, motions, away=[[9.0]] * len(poses))
+    watch, out = watched(poses, given, motions, seen_from(poses))
     assert watch.findings()
     assert math.hypot(*(out[-1].pose - poses[-1])[:2]) < math.hypot(*(given[-1] - poses[-1])[:2])
+
+
+def test_a_watch_gives_the_odometry_where_sightings_contradict_both():
+    poses, motions, _ = driven()
+    watch, _ = watched(poses, poses, motions, seen_from(poses, off=(2.0, 0.0)))
+    assert watch.findings()
+
+
+def test_a_watch_leaves_an_estimate_that_explains_few_sightings_where_the_odometry_explains_fewer():
+    """More than half of the ids are misread since the wheels slipped."""
+    poses, motions, _ = driven(n=900)
+    motions = motions.copy()
+    motions[300:320] += [0.1, 0.0, 0.05]
+    right, wrong = seen_from(poses), seen_from(poses, off=(2.0, 0.0))
+    mixed = [right[k] if k < 330 or k % 5 in (0, 2) else wrong[k] for k in range(len(poses))]
+    watch, out = watched(poses, poses, motions, mixed)
+    assert watch.sentence is None
+    assert all(e.protection.position_m < 1.0 for e in out)
 
 
 def test_a_gyro_of_another_axis_does_not_agree():
