@@ -1,7 +1,8 @@
 """Protection levels: bounds that the error of a pose exceeds with no more than a stated risk, also if a sensor lies.
 
 What may be wrong is a list of hypotheses, each with a prior: nothing but noise; one landmark displaced; wheels that
-slipped since the last fix, or just before it. Under each the error of the pose has a normal distribution: the landmark
+slipped since the last fix, or just before it; a constant of the installation that sightings contradict, as they have
+it. Under each the error of the pose has a normal distribution: the landmark
 modes follow, beside the estimator, how a displacement that has not been found out moves the pose and how likely it
 still is. The bound is the least one that keeps the probability of a larger error, over all hypotheses together, within
 the risk.
@@ -14,7 +15,7 @@ satellite navigation integrity" (posterior probabilities of the hypotheses in pl
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -148,6 +149,7 @@ class ProtectionLevels:
         checked: bool,
         slips_per_s: float = 0.0,
         fix: Fix | None = None,
+        as_seen: Iterable[tuple[str, FloatArray, FloatArray]] = (),
     ) -> Protection:
         """Bound of the newest pose.
 
@@ -158,6 +160,8 @@ class ProtectionLevels:
             checked: whether wheels are compared with an independent source of motion.
             slips_per_s: slips that were found in this run: where wheels slip, some slips pass unseen.
             fix: how sightings were used, if they were.
+            as_seen: constants that are held against the sightings, with mean ``(3,)`` and variance ``(3,)`` of the
+                pose's difference if these are right.
         """
         variance = _OVERBOUND**2 * np.diag(cov)
         widest = _OVERBOUND**2 * float(np.linalg.eigvalsh(cov[:2, :2])[-1])  # variance in the worst direction
@@ -166,6 +170,7 @@ class ProtectionLevels:
             for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED)
             if share > self._negligible
         ]
+        faults += [_Fault(name, 1.0, np.abs(mean), _OVERBOUND**2 * spread) for name, mean, spread in as_seen]
         slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
         if slip is not None and slip.share > self._negligible:
             faults.append(slip)

@@ -380,7 +380,13 @@ class Recorder:
             known = seen.predicted.installation or self._estimator.installed
             fix = Fix(seen.predicted, known, seen.lines, step.dt)
         protection = self._levels.of(
-            belief.cov + frame.added_cov, twist, tracking.since_fix_s, checked, self._motion.slips_per_s, fix
+            belief.cov + frame.added_cov,
+            twist,
+            tracking.since_fix_s,
+            checked,
+            self._motion.slips_per_s,
+            fix,
+            self._estimator.if_as_seen(),
         )
         return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground, protection)
 

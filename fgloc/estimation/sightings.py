@@ -80,7 +80,8 @@ class Association:
         named, nameless = self._naming.name(hits, predicted) if hits else ([], [])
         measurements = [*(m for m in measurements if not m.unnamed), *named] if hits else measurements
         judged = self._judge(measurements, predicted)
-        measurements, judged = self._revise(measurements, judged, predicted)
+        here = self._corrected([m for m, row in zip(measurements, judged, strict=True) if not row[2]], predicted)
+        measurements, judged = self._revise(measurements, judged, predicted, here)
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
             sighting = self._factors.sighting(k, m, m.cauchy_k, alone)
@@ -97,7 +98,7 @@ class Association:
             )
         if accepted:
             self._contradicting.clear()
-            for misread, sighting, decision in self._reassociate(k, stamp_ns, rejected, decisions, predicted):
+            for misread, sighting, decision in self._reassociate(k, stamp_ns, rejected, decisions, here):
                 rejected.remove(misread)
                 accepted.append(sighting)
                 decisions.append(decision)
@@ -116,8 +117,23 @@ class Association:
             )
         return accepted, rejected, decisions
 
+    def _corrected(self, accepted: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance) -> PoseWithCovariance:
+        """The pose that others than these are held against: the predicted one, or where they have it if it is vague.
+
+        Metres beside the robot a marker that was misread looks like one that hangs there.
+        """
+        if not accepted or not self._factors.known or is_linear(predicted):
+            return predicted
+        known = predicted.installation or self._factors.estimated
+        corrected = correct(predicted, known, accepted[:MOST_JOINT], self._factors)
+        return predicted if corrected is None else corrected[0]
+
     def _revise(
-        self, measurements: Sequence[LandmarkMeasurement], judged: Judged, predicted: PoseWithCovariance
+        self,
+        measurements: Sequence[LandmarkMeasurement],
+        judged: Judged,
+        predicted: PoseWithCovariance,
+        here: PoseWithCovariance,
     ) -> tuple[Sequence[LandmarkMeasurement], Judged]:
         """The measurements to be used and the verdict on each; some may be biased, or mean something else.
 
@@ -125,13 +141,14 @@ class Association:
             measurements: of one step.
             judged: what the gate makes of them.
             predicted: the pose.
+            here: the pose with those that are accepted.
         """
         taken, verdicts = list(measurements), list(judged)
         for i, (m, verdict) in enumerate(zip(measurements, judged, strict=True)):
             if not verdict[2] and self._config.weights.adaptive and self._is_biased(m, predicted):
                 verdicts[i] = verdict[0], verdict[1], "biased"
             if verdicts[i][2]:
-                taken[i], verdicts[i] = self._explained_otherwise(m, verdicts[i], predicted)
+                taken[i], verdicts[i] = self._explained_otherwise(m, verdicts[i], here)
         return taken, verdicts
 
     def _is_biased(self, m: LandmarkMeasurement, predicted: PoseWithCovariance) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 import gtsam
@@ -208,6 +208,21 @@ class Estimator(ABC):
     def _held(self) -> list[int]:
         """Rows of pose and installation together that are held."""
         return [3 + self.installation.index[name] for name in self.contradicted]
+
+    def if_as_seen(self) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+        """How the newest pose would differ if a held constant were what sightings made of it.
+
+        Yields:
+            Name of the constant, difference ``(3,)`` in the base's axes, and its variance ``(3,)``.
+        """
+        known, cross = (None, None) if self.belief is None else (self.belief.installation, self.belief.cross)
+        if known is None or cross is None:
+            return
+        prior = self.installation.prior()
+        for name, (value, sigma) in self.contradicted.items():
+            i = self.installation.index[name]
+            gain = cross[:, i] / known.cov[i, i]
+            yield name, gain * (value - prior.mean[i]), np.square(gain * sigma)
 
     def _hold_beyond_gate(self, belief: PoseWithCovariance) -> bool:
         """From now on hold what this belief has furthest beyond the gate of its prior; whether there was something.

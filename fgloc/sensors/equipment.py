@@ -186,9 +186,7 @@ class MotionCompensation:
                 tilt = _tilt(rates, (exposure_ns - step.stamp_ns) * 1e-9)
                 late = [m.tilted(tilt, rates) for m in late]
             if exposure_ns != step.stamp_ns:
-                motion, cov = self._wheels.motion_between(step, step.stamp_ns, exposure_ns)
-                if self._gyro is not None and step.inertial and abs(exposure_ns - step.stamp_ns) < _SHORT_NS:
-                    motion = np.array([*motion[:2], twist[2] * (exposure_ns - step.stamp_ns) * 1e-9])
+                motion, cov = self._motion_to(step, exposure_ns)
                 late = [m.compensated(motion, cov) for m in late]
             measured.extend(late)
         for sensed in step.sensed:
@@ -205,10 +203,23 @@ class MotionCompensation:
     def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
         """Motion ``T_keyframe_then`` ``(3,)`` to another time, with its covariance ``(3, 3)``."""
         motion, cov = self._wheels.motion_between(step, step.stamp_ns, at_ns)
-        if self._gyro is not None and step.inertial and abs(at_ns - step.stamp_ns) < _SHORT_NS:
-            turned = self._gyro.rates_at(step.inertial, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9
-            motion = np.array([*motion[:2], turned])
-        return motion, cov
+        turned = None if self._gyro is None else self._turned(self._gyro, step, at_ns)
+        return (motion if turned is None else np.array([*motion[:2], turned])), cov
+
+    def _turned(self, gyro: Gyro, step: Step, at_ns: int) -> float | None:
+        """Turn ``(T_keyframe_then)`` [rad] by the gyro; None: it was silent in that time."""
+        events = step.inertial
+        if not events:
+            return None
+        if abs(at_ns - step.stamp_ns) < _SHORT_NS:
+            return float(gyro.rates_at(events, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9)
+        first, last = sorted((at_ns, step.stamp_ns))
+        nodes = [first, *(e.stamp_ns for e in events if first < e.stamp_ns < last), last]
+        covered = [*nodes[:-1], min(last, events[-1].stamp_ns)]
+        if events[0].stamp_ns > first + _SHORT_NS or np.diff([*covered, last]).max() > _SHORT_NS:
+            return None
+        turn = float(np.trapezoid(gyro.rates_at(events, tuple(nodes)), np.array([n - first for n in nodes]) * 1e-9))
+        return turn if at_ns > step.stamp_ns else -turn
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Twist ``(3,)`` of the base [m/s, m/s, rad/s] at a time near the step's end."""

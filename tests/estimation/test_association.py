@@ -60,6 +60,13 @@ def test_a_misread_marker_is_known_by_its_place_only_beside_another(beside):
     assert {d.landmark_id: d.reason for d in rows if d.reason} == ({4: "misread"} if beside else {2: "gate", 3: "gate"})
 
 
+def test_what_a_misread_marker_is_follows_from_the_others_where_the_pose_is_vague():
+    """The robot is 0.6 m beside where it is said to be: from there marker 4 looks like marker 3."""
+    walls = row_of(*ROW.landmarks.values(), standing(9, -3.0, 0.0, 0.0))
+    (rows,) = judged(walls, image(walls, (1, 1), (2, 2), (4, 9)), at=(0.0, -0.6, 0.0), sigmas=(0.3, 0.3, 0.1))
+    assert accepted(rows) == [1, 2, 4]
+
+
 def test_of_two_markers_that_hang_there_neither_is_taken():
     twins = row_of(hanging(1, -0.4), hanging(2, 0.2), hanging(3, -0.401), hanging(4, 1.2))
     (rows,) = judged(twins, image(twins, (2, 2), (1, 4)))

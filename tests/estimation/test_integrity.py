@@ -70,6 +70,16 @@ def test_a_landmark_that_may_be_displaced_is_named_while_it_matters():
     assert bound(Modes(displaced(7, 1e-3, 0.0, 1e-5))).cause == "noise"
 
 
+def test_a_constant_that_sightings_contradict_may_be_as_they_have_it():
+    levels = ProtectionLevels(IntegrityConfig(), Modes())
+    shift, spread = np.array([0.0, 0.02, 0.04]), np.array([0.0, 0.001, 0.002]) ** 2
+    found = levels.of(COV, DRIVES, 0.0, False, as_seen=[("camera.ry_rad", shift, spread)])
+    sigmas = np.sqrt(np.diag(COV) + spread)
+    assert found.cause == "camera.ry_rad"
+    assert (2.0 * norm.sf((found.bound - shift) / sigmas)[1:] < 1e-3 / 360.0).all()
+    assert found.bound[0] == pytest.approx(bound().bound[0], rel=0.1)
+
+
 def test_in_the_dark_a_slip_may_go_unseen_and_less_of_it_between_two_sources():
     fixed, dark, checked = bound(), bound(since_fix_s=5.0), bound(since_fix_s=5.0, checked=True)
     assert dark.cause == "slip"
