@@ -26,7 +26,7 @@ from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Camera, Estimate, Event, FloatArray, Landmark, LandmarkMap
 
-CASES = ("none", "slip", "dark30", "ids30", "moved", "frozen", "onewheel", "blurred", "late", "mixed")
+CASES = ("none", "slip", "dark30", "ids30", "moved", "frozen", "onewheel", "blurred", "late", "mixed", "knocked")
 _TICK_S = 0.01
 _ODOMETRY, _IMU, _IMAGE = 10, 5, 50  # ticks
 _HALL = (8.0, 5.0)  # m: half of its length and width
@@ -34,6 +34,7 @@ _SIZE_M, _HEIGHT_M = 0.3, 0.6
 _LAP_S = 70.0
 _WHEEL_NOISE, _GYRO_NOISE, _CORNER_PX = 0.02, 0.005, 0.3
 _TRACK_M = 0.4
+_KNOCK_M, _KNOCK_RAD = 0.03, 0.05  # sigmas of what a knock does to a camera
 _FAR_M, _GRAZING, _LEAST_PX = 10.0, 0.3, 10.0  # a marker is not found farther off, flatter or smaller than this
 _LOOKS = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_base_cam of a camera that looks ahead
 _EPISODES: dict[str, tuple[float, float, float]] = {  # s: from one beginning to the next, shortest, longest
@@ -211,6 +212,11 @@ class _Eye:
         self._k = rng.normal(0.0, f * config.distortion_sigma, 2)
         late = drive.config.camera.time_offset_sigma_s
         self._late_s = float(rng.normal(0.0, f * late)) + (0.06 if drive.case == "late" else 0.0)
+        self._knocked = math.inf  # tick from which on the camera looks elsewhere
+        if drive.case == "knocked":
+            self._knocked = float(rng.uniform(0.1, 0.9)) * len(drive.truth)
+            self._turn = Rotation.from_rotvec(rng.normal(0.0, _KNOCK_RAD, 3)).as_matrix()
+            self._push = rng.normal(0.0, _KNOCK_M, 3)
         held = list(drive.true_landmarks.values())
         self._ids = np.array([one.landmark_id for one in held])
         self._corners = np.array([one.corners() for one in held])  # (n, 4, 3)
@@ -218,6 +224,8 @@ class _Eye:
 
     def image(self, tick: int, stamp: int, noise: float) -> CornersEvent:
         """Markers found in the image of a tick; its stamp is off by as much as the clock of the camera."""
+        if tick >= self._knocked:
+            self._R, self._t, self._knocked = self._turn @ self._R, self._t + self._push, math.inf
         at = min(max(tick - self._late_s / _TICK_S, 0.0), len(self._drive.truth) - 1.0)
         x, y, yaw = self._drive.true_pose(START_NS + round(at * _TICK_S * 1e9))
         c, s = math.cos(yaw), math.sin(yaw)

@@ -1,11 +1,11 @@
 """Protection levels: bounds that the error of a pose exceeds with no more than a stated risk, also if a sensor lies.
 
 What may be wrong is a list of hypotheses, each with a prior: nothing but noise; one landmark displaced; wheels that
-slipped since the last fix, or just before it; a constant of the installation that sightings contradict, as they have
-it. Under each the error of the pose has a normal distribution: the landmark
-modes follow, beside the estimator, how a displacement that has not been found out moves the pose and how likely it
-still is. The bound is the least one that keeps the probability of a larger error, over all hypotheses together, within
-the risk.
+slipped since the last fix, or just before it; the mounting of a sensor changed; a constant of the installation that
+sightings contradict, as they have it. Under each the error of the pose has a normal distribution: the modes of
+landmarks and mountings follow, beside the estimator, how a displacement that has not been found out moves the pose and
+how likely it still is. The bound is the least one that keeps the probability of a larger error, over all hypotheses
+together, within the risk.
 
 Sources: Blanch, Walter, Enge et al. 2015, "Baseline advanced RAIM user algorithm and possible improvements" (one bound
 for all hypotheses together); Pervan, Pullen, Christie 1998, "A multiple hypothesis approach to
@@ -34,6 +34,7 @@ _HALVINGS = 10  # by which the bound is found to a thousandth
 # Sigma of the errors over that of the covariance, in the tail: models of noise are Gaussian, its tails are not
 _OVERBOUND = 1.3
 _DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and nobody knows
+_KNOCKED = 1e-4  # prior that the mounting of a sensor has changed since it was measured
 _SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second, beside as many as they do show ...
 _SLIP_LASTS_S = 1.0  # ... each at most so long, at the speed of the wheels
 _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
@@ -171,6 +172,11 @@ class ProtectionLevels:
             if share > self._negligible
         ]
         faults += [_Fault(name, 1.0, np.abs(mean), _OVERBOUND**2 * spread) for name, mean, spread in as_seen]
+        faults += [
+            _Fault(f"mounting of {sensor_name(kind)}", share, np.abs(bias), spread)
+            for kind, share, bias, spread in self._modes.mounts.displaced(_KNOCKED)
+            if share > self._negligible
+        ]
         slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
         if slip is not None and slip.share > self._negligible:
             faults.append(slip)
@@ -240,6 +246,12 @@ class ProtectionLevels:
     def _is_alert(self, position_m: float, yaw_rad: float) -> bool:
         limit, yaw = self._config.alert_m, self._config.alert_yaw_rad
         return (limit is not None and position_m > limit) or (yaw is not None and yaw_rad > yaw)
+
+
+def sensor_name(kind: str) -> str:
+    """Name for the user of the sensor that makes sightings of this kind: ``camera front`` of ``front/corners``."""
+    camera, _, made = kind.rpartition("/")
+    return f"camera {camera}".strip() if made == "corners" else f"sensor of {kind}"
 
 
 def _tails(gap: FloatArray, sigma: FloatArray) -> FloatArray:

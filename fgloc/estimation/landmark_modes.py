@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +80,89 @@ def rotation_cov(H: FloatArray, rows: tuple[int, int]) -> FloatArray:
     return np.asarray(by_marker @ by_marker.T)
 
 
+# --- A sensor that was knocked ----------------------------------------------------------------------------------------
+
+_KNOCKED = np.array([0.03, 0.03, 0.05])  # m, m, rad: prior sigma of a mounting's change, in the base's axes
+
+
+@dataclass(slots=True, eq=False)
+class _Mount:
+    """Hypothesis "its mounting has changed by δ"."""
+
+    M: FloatArray  # (3 + n, 3) derivative of the error of pose and installation by δ
+    moved: FloatArray = field(default_factory=lambda: np.zeros(3))  # δ
+    information: FloatArray = field(default_factory=lambda: np.diag(_KNOCKED**-2.0))  # on δ
+    evidence: float = 0.0
+
+
+class MountModes:
+    """The hypotheses that the mounting of a landmark sensor is another one than the estimator takes it to be.
+
+    A sensor that was turned or pushed on the robot sees what it would see from another pose: δ enters its sightings as
+    the pose does. All of them agree; only the way that the robot drives contradicts them.
+    """
+
+    def __init__(self, states: int, alarm: float) -> None:
+        """Take the number of states beside δ, pose included, and the evidence that ends a hypothesis."""
+        self._states, self._alarm = states, alarm
+        self._of: dict[str, _Mount] = {}
+
+    def reset(self) -> None:
+        """Forget all evidence."""
+        self._of = {name: _Mount(np.zeros((self._states, 3))) for name in self._of}
+
+    def move(self, A: FloatArray, D: FloatArray) -> None:
+        """Follow a motion by its derivatives; see `transition`."""
+        for mount in self._of.values():
+            mount.M[:3] = A @ mount.M[:3] + D @ mount.M[3:]
+
+    def take(self, H: FloatArray, W: FloatArray, w: FloatArray, gain: FloatArray, rows: Sequence[str]) -> None:
+        """Add the evidence of the sightings of a keyframe.
+
+        Args:
+            H: ``(d, 3 + n)`` by pose and installation.
+            W: ``(d, d)`` whitening of their innovation.
+            w: ``(d,)`` that innovation, white.
+            gain: ``(3 + n, d)`` of the estimator on it.
+            rows: sensor of each row; "" of what is of none.
+        """
+        for name in dict.fromkeys(rows):
+            if name and name not in self._of:
+                self._of[name] = _Mount(np.zeros((self._states, 3)))
+        of = np.array(rows)
+        for name, mount in self._of.items():
+            G = -(H @ mount.M)
+            own = of == name
+            G[own] -= H[own, :3]
+            G = W @ G
+            gap = w - G @ mount.moved
+            before, pull = mount.information, G.T @ gap
+            mount.information = before + G.T @ G
+            step = np.linalg.solve(mount.information, pull)
+            grown = np.linalg.slogdet(mount.information)[1] - np.linalg.slogdet(before)[1]
+            mount.moved = mount.moved + step
+            mount.evidence += float(w @ w - gap @ gap + pull @ step - grown)
+            mount.M += gain @ G
+            if mount.evidence < -self._alarm:  # it was in place; it may be moved from now on
+                mount.M, mount.evidence = np.zeros_like(mount.M), 0.0
+                mount.moved, mount.information = np.zeros(3), np.diag(_KNOCKED**-2.0)
+
+    def displaced(self, prior: float) -> Iterator[tuple[str, float, FloatArray, FloatArray]]:
+        """Each sensor, the probability that its mounting has changed, and what that does to the pose.
+
+        As `LandmarkModes.displaced`.
+        """
+        for name, mount in self._of.items():
+            M, spread = mount.M[:3], np.linalg.inv(mount.information)
+            yield name, _share(prior, mount.evidence), M @ mount.moved, np.diag(M @ spread @ M.T)
+
+
+def _share(prior: float, evidence: float) -> float:
+    """Probability of a hypothesis by its prior, and twice the log-likelihood ratio to its contrary."""
+    odds = math.log(prior) - math.log1p(-prior) + 0.5 * min(max(evidence, -1e3), 1e3)
+    return 1.0 / (1.0 + math.exp(-odds))
+
+
 # --- The hypotheses ---------------------------------------------------------------------------------------------------
 
 _LEAST_M = 0.15  # of a displacement that is named: less may be a survey
@@ -94,6 +178,7 @@ class LandmarkModes:
     Attributes:
         displacements: of the landmarks that were found to be moved ``(2,)`` [m] in the map.
         alarm: evidence, twice the log-likelihood ratio to "in place", that names a landmark.
+        mounts: hypotheses of the sensors that see them.
     """
 
     def __init__(self, config: Config, factors: LandmarkFactors) -> None:
@@ -110,12 +195,14 @@ class LandmarkModes:
         self._information = np.zeros((n, 2, 2))  # on δ, of independent sightings of itself
         self._last_ns: dict[int, int] = {}
         self.displacements: dict[int, FloatArray] = {}
+        self.mounts = MountModes(3 + len(factors.installation), self.alarm)
         self._returned: dict[int, float] = {}  # evidence that a landmark which is left out is in place
         self.restart()
 
     def restart(self) -> None:
         """Forget all evidence but the landmarks left out, as the pose was set anew."""
         self._reset(np.ones(len(self._ids), dtype=np.bool_))
+        self.mounts.reset()
         self._returned.clear()
         self._in_place: set[int] = set()
         self._fused_ns = 0
@@ -143,11 +230,9 @@ class LandmarkModes:
         M = self._M[:, :3]
         spread = np.einsum("lij,ljk,lik->li", M, self._cov, M)
         bias = np.einsum("lij,lj->li", M, self._moved)
-        odds = math.log(prior) - math.log1p(-prior) + 0.5 * np.clip(evidence, -1e3, 1e3)
-        share = 1.0 / (1.0 + np.exp(-odds))
         for landmark_id, row in self._rows.items():
             if not self.excludes(landmark_id):
-                yield landmark_id, float(share[row]), bias[row], spread[row]
+                yield landmark_id, _share(prior, float(evidence[row])), bias[row], spread[row]
 
     def sensitivity(self, landmark_id: int) -> FloatArray:
         """Derivative ``(3 + n, 2)`` of the error of pose and installation by a landmark's displacement."""
@@ -184,6 +269,7 @@ class LandmarkModes:
         if motions:
             A, D = transition(motions, self._factors.installation)
             self._M[:, :3] = A @ self._M[:, :3] + D @ self._M[:, 3:]
+            self.mounts.move(A, D)
         if fused:
             self._take(predicted, belief, [s.measurement for s in fused], lines)
             self._in_place.update(s.alone.landmark_id for s in seen)
@@ -268,7 +354,10 @@ class LandmarkModes:
         for m, part in zip(seen, parts, strict=True):
             if m.of_landmark:
                 self._weigh(m, w[part], G[:, part])
-        self._M += (P @ found.H.T @ W.T) @ G
+        gain = P @ found.H.T @ W.T
+        self._M += gain @ G
+        sensors = [m.row_kind if m.of_landmark else "" for m, part in zip(seen, parts, strict=True) for _ in w[part]]
+        self.mounts.take(found.H, W, w, gain, sensors)
 
     def _contradicted(self, P: FloatArray, belief: PoseWithCovariance, m: LandmarkMeasurement) -> None:
         """A sighting that was rejected; how its own landmark's displacement explains it may be far from linear."""

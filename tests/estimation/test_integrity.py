@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from fgloc import se2
 from fgloc.config import IntegrityConfig
 from fgloc.estimation.integrity import Fix, ProtectionLevels
+from fgloc.estimation.landmark_modes import MountModes
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.observation import Lines
@@ -19,7 +21,7 @@ class Modes:
     """Hypotheses of displaced landmarks, as `LandmarkModes.displaced` gives them: (id, share, bias, variance)."""
 
     def __init__(self, *rows):
-        self._rows = rows
+        self._rows, self.mounts = rows, MountModes(3, 20.0)
 
     def displaced(self, prior):
         return iter(self._rows)
@@ -78,6 +80,38 @@ def test_a_constant_that_sightings_contradict_may_be_as_they_have_it():
     assert found.cause == "camera.ry_rad"
     assert (2.0 * norm.sf((found.bound - shift) / sigmas)[1:] < 1e-3 / 360.0).all()
     assert found.bound[0] == pytest.approx(bound().bound[0], rel=0.1)
+
+
+def test_a_camera_that_was_knocked_moves_the_pose_that_it_alone_tells():
+    """Its sightings agree with each other; the bound covers what a change of its mounting would do."""
+    modes, H = Modes(), np.eye(3) / 0.001
+    W = np.linalg.inv(np.linalg.cholesky(H @ H.T + np.eye(3)))  # it tells the first pose
+    modes.mounts.take(H, W, np.zeros(3), H.T @ W.T, ["front/corners"] * 3)
+    found = bound(modes)
+    assert found.cause == "mounting of camera front"
+    assert 0.03 < found.position_m < 0.2
+    assert 0.05 < found.bound[2] < 0.3
+
+
+def test_the_way_a_robot_drives_tells_that_its_camera_was_turned():
+    """It drives straight on for 10 m, and the turned camera has it going aslant by 0.06 rad."""
+    modes, H, cov, pose = MountModes(3, 20.0), np.eye(3) / 0.002, COV.copy(), np.zeros(3)
+    per_step = np.diag([0.01, 0.002, 0.002]) ** 2
+    for k in range(1, 21):
+        A = se2.adjoint(se2.inverse(np.array([0.5, 0.0, 0.0])))
+        cov, pose = A @ cov @ A.T + per_step, se2.compose(pose, np.array([0.5, 0.0, 0.0]))
+        modes.move(A, np.zeros((3, 0)))
+        told = se2.compose(np.array([0.5 * k, 0.0, 0.0]), np.array([0.0, 0.0, 0.06]))
+        innovation = H @ se2.log(se2.between(told, pose))
+        S = H @ cov @ H.T + np.eye(3)
+        W = np.linalg.inv(np.linalg.cholesky(S))
+        gain = cov @ H.T @ W.T
+        modes.take(H, W, W @ innovation, gain, ["corners"] * 3)
+        pose = se2.compose(pose, se2.exp(-gain @ W @ innovation))
+        cov = cov - gain @ gain.T
+    ((name, share, mean, _),) = modes.displaced(1e-4)
+    assert (name, share > 0.99) == ("corners", True)
+    assert abs(mean[2]) == pytest.approx(0.06, abs=0.01)
 
 
 def test_in_the_dark_a_slip_may_go_unseen_and_less_of_it_between_two_sources():
