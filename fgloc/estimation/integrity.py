@@ -1,11 +1,11 @@
 """Protection levels: bounds that the error of a pose exceeds with no more than a stated risk, also if a sensor lies.
 
 What may be wrong is a list of hypotheses, each with a prior: nothing but noise; one landmark displaced; wheels that
-slipped since the last fix, or just before it; the mounting of a sensor changed; a constant of the installation that
-sightings contradict, as they have it. Under each the error of the pose has a normal distribution: the modes of
-landmarks and mountings follow, beside the estimator, how a displacement that has not been found out moves the pose and
-how likely it still is. The bound is the least one that keeps the probability of a larger error, over all hypotheses
-together, within the risk.
+slipped since the last fix, or just before it; the robot carried away; the mounting of a sensor changed; a constant of
+the installation that sightings contradict, as they have it. Under each the error of the pose has a normal distribution:
+the modes of landmarks and mountings follow, beside the estimator, how a displacement that has not been found out moves
+the pose and how likely it still is. The bound is the least one that keeps the probability of a larger error, over all
+hypotheses together, within the risk.
 
 Sources: Blanch, Walter, Enge et al. 2015, "Baseline advanced RAIM user algorithm and possible improvements" (one bound
 for all hypotheses together); Pervan, Pullen, Christie 1998, "A multiple hypothesis approach to
@@ -151,6 +151,7 @@ class ProtectionLevels:
         slips_per_s: float = 0.0,
         fix: Fix | None = None,
         as_seen: Iterable[tuple[str, FloatArray, FloatArray]] = (),
+        carried: tuple[float, FloatArray] = (0.0, np.zeros(3)),
     ) -> Protection:
         """Bound of the newest pose.
 
@@ -163,6 +164,7 @@ class ProtectionLevels:
             fix: how sightings were used, if they were.
             as_seen: constants that are held against the sightings, with mean ``(3,)`` and variance ``(3,)`` of the
                 pose's difference if these are right.
+            carried: probability that the robot was carried away, and variance ``(3,)`` of the error then.
         """
         variance = _OVERBOUND**2 * np.diag(cov)
         widest = _OVERBOUND**2 * float(np.linalg.eigvalsh(cov[:2, :2])[-1])  # variance in the worst direction
@@ -180,6 +182,8 @@ class ProtectionLevels:
         slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
         if slip is not None and slip.share > self._negligible:
             faults.append(slip)
+        if carried[0] > self._negligible:
+            faults.append(_Fault("carried away", carried[0], np.zeros(3), carried[1]))
         self._agreeing += 0 if fix is None else len(fix.lines)
         if (share := _WRONG_JUMP * _BY_ACCIDENT**self._agreeing) > self._negligible:
             faults.append(_Fault("place", share, np.zeros(3), _ELSEWHERE))

@@ -360,7 +360,8 @@ class Recorder:
             frame.mode = Mode.DEAD_RECKONING
         twist = self._compensation.twist(step, step.stamp_ns)
         by_clock = np.asarray(np.outer(twist, twist) * self._clock_sigma_s**2)
-        frame.added_cov = by_clock + tracking.kidnapped_cov(self._sightings.contradicting, belief)
+        carried, around = tracking.kidnapped(self._sightings.contradicting, belief)
+        frame.added_cov = by_clock + carried * around  # of a mixture of two Gaussians, the second one wide
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + tracking.lost_cov(belief)
         modes = mode_decisions(frame.k, step.stamp_ns, frame.mode, tracking.since_fix_s, self._dead_reckoning_after_s)
@@ -380,13 +381,14 @@ class Recorder:
             known = seen.predicted.installation or self._estimator.installed
             fix = Fix(seen.predicted, known, seen.lines, step.dt)
         protection = self._levels.of(
-            belief.cov + frame.added_cov,
+            belief.cov + frame.added_cov - carried * around,
             twist,
             tracking.since_fix_s,
             checked,
             self._motion.slips_per_s,
             fix,
             self._estimator.if_as_seen(),
+            (carried, np.diag(around)),
         )
         return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground, protection)
 

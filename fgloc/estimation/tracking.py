@@ -139,21 +139,21 @@ class Tracking:
         """Note that sightings agree on another place than the given one."""
         self.initial_pose_conflict = se2.between(predicted.pose, place.pose)
 
-    def kidnapped_cov(self, contradicting: int, belief: PoseWithCovariance) -> FloatArray:
-        """Covariance ``(3, 3)`` to add to a pose that all landmarks seen since the last fix contradict.
+    def kidnapped(self, contradicting: int, belief: PoseWithCovariance) -> tuple[float, FloatArray]:
+        """Probability that a robot was carried away, as all landmarks seen since the last fix contradict its pose.
 
-        Either each of them is wrong by itself, or the robot was carried away, and may be where the landmarks are.
+        Either each of them is wrong by itself, or the robot may be where the landmarks are.
 
         Args:
             contradicting: how many landmarks.
             belief: the pose.
 
-        Source: the covariance of a mixture of two Gaussians, the second one wide.
+        Returns:
+            The probability, and the covariance ``(3, 3)`` of the pose's error if it holds.
         """
         if contradicting == 0 or not self._known or self._given or len(self._places) == 0:
-            return np.zeros((3, 3))
-        kidnapped = CARRIED / (CARRIED + WRONG_LANDMARK**contradicting)
-        return kidnapped * self._spread_of_map(belief)
+            return 0.0, np.zeros((3, 3))
+        return CARRIED / (CARRIED + WRONG_LANDMARK**contradicting), self._spread_of_map(belief)
 
     def lost_cov(self, belief: PoseWithCovariance) -> FloatArray:
         """Covariance ``(3, 3)`` to add to a lost robot's pose; 0 if the belief itself is wide enough to be lost."""

@@ -114,6 +114,14 @@ def test_the_way_a_robot_drives_tells_that_its_camera_was_turned():
     assert abs(mean[2]) == pytest.approx(0.06, abs=0.01)
 
 
+def test_a_robot_that_may_have_been_carried_away_is_bounded_by_the_hall():
+    found = ProtectionLevels(IntegrityConfig(), Modes()).of(
+        COV, DRIVES, 0.0, False, carried=(0.01, np.square([4.0, 4.0, 1.8]))
+    )
+    assert found.cause == "carried away"
+    assert 0.01 * 2.0 * norm.sf(found.bound[0] / 4.0) == pytest.approx(1e-3 / 360.0 / 3.0, rel=0.05)
+
+
 def test_in_the_dark_a_slip_may_go_unseen_and_less_of_it_between_two_sources():
     fixed, dark, checked = bound(), bound(since_fix_s=5.0), bound(since_fix_s=5.0, checked=True)
     assert dark.cause == "slip"
