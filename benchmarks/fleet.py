@@ -34,7 +34,7 @@ _SIZE_M, _HEIGHT_M = 0.3, 0.6
 _LAP_S = 70.0
 _WHEEL_NOISE, _GYRO_NOISE, _CORNER_PX = 0.02, 0.005, 0.3
 _TRACK_M = 0.4
-_KNOCK_M, _KNOCK_RAD = 0.03, 0.05  # sigmas of what a knock does to a camera
+_KNOCK_M, _KNOCK_RAD = 0.03, 0.05  # sigmas of what a hard knock does to a camera, on each axis
 _FAR_M, _GRAZING, _LEAST_PX = 10.0, 0.3, 10.0  # a marker is not found farther off, flatter or smaller than this
 _LOOKS = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_base_cam of a camera that looks ahead
 _EPISODES: dict[str, tuple[float, float, float]] = {  # s: from one beginning to the next, shortest, longest
@@ -133,7 +133,7 @@ class Drive:
     def events(self) -> Iterator[Event]:
         """All events in their order."""
         rng = np.random.default_rng([self.seed, 3])
-        told = (self.case,) if self.case in _EPISODES else _MIXED if self.case == "mixed" else ()
+        told = {"mixed": _MIXED, "knocked": ("dark30",)}.get(self.case, (self.case,) if self.case in _EPISODES else ())
         fails = {case: self._spans(case, rng) for case in told}
         nowhere = np.zeros(len(self.truth), dtype=np.bool_)
         dark, blurred = fails.get("dark30", nowhere), fails.get("blurred", nowhere)
@@ -215,8 +215,12 @@ class _Eye:
         self._knocked = math.inf  # tick from which on the camera looks elsewhere
         if drive.case == "knocked":
             self._knocked = float(rng.uniform(0.1, 0.9)) * len(drive.truth)
-            self._turn = Rotation.from_rotvec(rng.normal(0.0, _KNOCK_RAD, 3)).as_matrix()
-            self._push = rng.normal(0.0, _KNOCK_M, 3)
+            level = rng.random() < 0.5  # then no image contradicts it
+            size = rng.uniform(0.2, 1.0)
+            turn, push = rng.normal(0.0, size * _KNOCK_RAD, 3), rng.normal(0.0, size * _KNOCK_M, 3)
+            if level:
+                turn[:2], push[2] = 0.0, 0.0
+            self._turn, self._push = Rotation.from_rotvec(turn).as_matrix(), push
         held = list(drive.true_landmarks.values())
         self._ids = np.array([one.landmark_id for one in held])
         self._corners = np.array([one.corners() for one in held])  # (n, 4, 3)

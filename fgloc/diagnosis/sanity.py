@@ -10,7 +10,7 @@ compared:
   an unknown map, the median of where the trajectory itself has it.
 
 `Sanity.judge` compares whole trajectories at the end of a run, and gives the simpler one where it is better. `Watch`
-does so while a run goes on, by the motion alone: its poses depend on nothing later.
+does so while a run goes on: its poses depend on nothing later.
 """
 
 from __future__ import annotations
@@ -823,7 +823,7 @@ class Watch:
         if len(self._seen) >= _SIGHTINGS and (self._seen[-1].stamp_ns - self._seen[0].stamp_ns) * 1e-9 > 0.5 * _SEEN_S:
             away = np.array([one.away for one in self._seen])
             explained = float(np.mean(away < _EXPLAINED))
-            if not supported(explained, float(np.median(away))) and self._by_odometry() > explained - _MORE:
+            if not supported(explained, float(np.median(away))) and self._is_better_by_odometry(explained):
                 return f"it explains {_percent(explained)} of the sightings of {_SEEN_S:.0f} s"
         moving = [w for w in self._windows if w is not None]
         if not self._mapped and self._predicted is not None:
@@ -838,15 +838,26 @@ class Watch:
             return f"over {len(moving)} windows of {_WINDOW_S:.0f} s it departs by {_percent(departure)} of the path"
         return None
 
-    def _by_odometry(self) -> float:
-        """Share of the sightings that the odometry explains which would be given in place of the estimate."""
-        carried = self._carried or self._last_sane()
+    def _is_better_by_odometry(self, explained: float) -> bool:
+        """Whether the odometry, which would be given in place of the estimate, explains about as many sightings.
+
+        One that goes on from the estimate itself explains as many and is no better: only if that is next to none.
+        """
+        carried = self._carried
+        if carried is None and not any(self._strained()):
+            return explained < _MORE
+        carried = carried or self._last_sane()
         if carried is None:
-            return 0.0
+            return False
         T = se2.compose(carried[0], se2.inverse(self._odometry))
         places = se2.placed(T, np.array([one.by_odometry for one in self._seen]))
         off = places - np.array([one.seen.landmark for one in self._seen])
-        return float(np.mean(np.hypot(*off.T) < _EXPLAINED * np.array([one.seen.sigma for one in self._seen])))
+        near = np.hypot(*off.T) < _EXPLAINED * np.array([one.seen.sigma for one in self._seen])
+        return float(np.mean(near)) > explained - _MORE
+
+    def _strained(self) -> list[bool]:
+        """Whether the estimate departs from the odometry, by window in which the robot moves."""
+        return [w is not None and departs(w.departure, w.strain, self._mapped) for w in self._windows]
 
     def _returned(self, estimate: Estimate) -> bool:
         """Whether an estimate that has failed can be given again; without a map it must be near the odometry."""
@@ -858,8 +869,7 @@ class Watch:
 
     def _last_sane(self) -> tuple[FloatArray, FloatArray] | None:
         """Pose and covariance now: those before the first window that departs, with the odometry since."""
-        strained = [w is None or departs(w.departure, w.strain, self._mapped) for w in self._windows]
-        first = next((i for i, w in enumerate(self._windows) if w is not None and strained[i]), len(self._windows))
+        first = next((i for i, strained in enumerate(self._strained()) if strained), len(self._windows))
         edges = list(self._edges)
         pending = [] if self._start is None else [_Edge(0, self._start, self._motion, self._cov, self._path)]
         edges = [*edges, *pending][first if first < len(edges) else max(len(edges) - 1, 0) :]

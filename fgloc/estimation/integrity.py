@@ -34,7 +34,6 @@ _HALVINGS = 10  # by which the bound is found to a thousandth
 # Sigma of the errors over that of the covariance, in the tail: models of noise are Gaussian, its tails are not
 _OVERBOUND = 1.3
 _DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and nobody knows
-_KNOCKED = 1e-4  # prior that the mounting of a sensor has changed since it was measured
 _SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second, beside as many as they do show ...
 _SLIP_LASTS_S = 1.0  # ... each at most so long, at the speed of the wheels
 _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
@@ -63,6 +62,11 @@ class _Fault:
     mean: FloatArray
     added: FloatArray
     most: FloatArray = field(default_factory=lambda: _UNBOUNDED)
+
+    def beside(self, other: _Fault) -> _Fault:
+        """Both at once, as probable as this one alone."""
+        mean, added = self.mean + other.mean, self.added + other.added
+        return _Fault(self.name, self.share, mean, added, self.most + 10.0 * np.sqrt(other.added))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,10 +177,9 @@ class ProtectionLevels:
             for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED)
             if share > self._negligible
         ]
-        faults += [_Fault(name, 1.0, np.abs(mean), _OVERBOUND**2 * spread) for name, mean, spread in as_seen]
         faults += [
             _Fault(f"mounting of {sensor_name(kind)}", share, np.abs(bias), spread)
-            for kind, share, bias, spread in self._modes.mounts.displaced(_KNOCKED)
+            for kind, share, bias, spread in self._modes.mounts.displaced()
             if share > self._negligible
         ]
         slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
@@ -187,6 +190,14 @@ class ProtectionLevels:
         self._agreeing += 0 if fix is None else len(fix.lines)
         if (share := _WRONG_JUMP * _BY_ACCIDENT**self._agreeing) > self._negligible:
             faults.append(_Fault("place", share, np.zeros(3), _ELSEWHERE))
+        if held := list(as_seen):  # beside each of the others, too
+            off = _Fault(
+                ", ".join(name for name, *_ in held),
+                1.0,
+                np.sum([np.abs(mean) for _, mean, _ in held], axis=0),
+                _OVERBOUND**2 * np.sum([spread for *_, spread in held], axis=0),
+            )
+            faults = [off, *faults, *(f.beside(off) for f in faults)]
         sound = np.sqrt([*variance, widest])
         bound, cause = self._least(sound, faults)
         return Protection(bound[:3], float(bound[3]), cause, self._is_alert(float(bound[3]), float(bound[2])))

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,44 +81,79 @@ def rotation_cov(H: FloatArray, rows: tuple[int, int]) -> FloatArray:
 
 # --- A sensor that was knocked ----------------------------------------------------------------------------------------
 
-_KNOCKED = np.array([0.03, 0.03, 0.05])  # m, m, rad: prior sigma of a mounting's change, in the base's axes
+_KNOCKED = np.array([0.03, 0.03, 0.05])  # m, m, rad: sigma of a mounting's change, in the base's axes
+_WRONG_FROM_THE_START = 1e-4  # probability that a mounting is another one than it was measured to be ...
+_KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards
+_MOST_ONSETS = 8  # of one sensor
 
 
-@dataclass(slots=True, eq=False)
-class _Mount:
-    """Hypothesis "its mounting has changed by δ"."""
+class _Onsets:
+    """Hypotheses "the mounting of a sensor changed by δ before this keyframe", the first one: before all of them.
 
-    M: FloatArray  # (3 + n, 3) derivative of the error of pose and installation by δ
-    moved: FloatArray = field(default_factory=lambda: np.zeros(3))  # δ
-    information: FloatArray = field(default_factory=lambda: np.diag(_KNOCKED**-2.0))  # on δ
-    evidence: float = 0.0
+    Attributes:
+        M: ``(k, 3 + n, 3)`` derivative of the error of pose and installation by δ.
+        moved: ``(k, 3)`` δ.
+        information: ``(k, 3, 3)`` on δ.
+        evidence: ``(k,)`` twice the log-likelihood ratio to "in place".
+        prior: ``(k,)`` probability.
+        last_ns: stamp of the sensor's last sightings.
+    """
+
+    def __init__(self, states: int) -> None:
+        self.M, self.moved = np.zeros((0, states, 3)), np.zeros((0, 3))
+        self.information, self.evidence, self.prior = np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
+        self.last_ns: int | None = None
+
+    def begin(self, stamp_ns: int) -> None:
+        """Add a hypothesis that begins now; the least probable of the others goes if there are too many."""
+        prior = _WRONG_FROM_THE_START
+        if self.last_ns is not None:
+            prior = max(stamp_ns - self.last_ns, 0) * 1e-9 * _KNOCKS_PER_S
+        self.last_ns = stamp_ns
+        if prior == 0.0:
+            return
+        if len(self.prior) == _MOST_ONSETS:
+            self._keep(1 + int(np.argmin(self.evidence[1:] + 2.0 * np.log(self.prior[1:]))))
+        self.M = np.concatenate([self.M, np.zeros((1, *self.M.shape[1:]))])
+        self.moved = np.concatenate([self.moved, np.zeros((1, 3))])
+        self.information = np.concatenate([self.information, np.diag(_KNOCKED**-2.0)[None]])
+        self.evidence, self.prior = np.append(self.evidence, 0.0), np.append(self.prior, prior)
+
+    def _keep(self, without: int) -> None:
+        kept = np.arange(len(self.prior)) != without
+        self.M, self.moved, self.information = self.M[kept], self.moved[kept], self.information[kept]
+        self.evidence, self.prior = self.evidence[kept], self.prior[kept]
 
 
 class MountModes:
     """The hypotheses that the mounting of a landmark sensor is another one than the estimator takes it to be.
 
     A sensor that was turned or pushed on the robot sees what it would see from another pose: δ enters its sightings as
-    the pose does. All of them agree; only the way that the robot drives contradicts them.
+    the pose does. All of them agree; only the way that the robot drives contradicts them. The change came before the
+    run, in a gap of the sightings or between any two of them: those onsets are followed that explain most.
     """
 
-    def __init__(self, states: int, alarm: float) -> None:
-        """Take the number of states beside δ, pose included, and the evidence that ends a hypothesis."""
-        self._states, self._alarm = states, alarm
-        self._of: dict[str, _Mount] = {}
+    def __init__(self, states: int) -> None:
+        """Take the number of states beside δ, pose included."""
+        self._states = states
+        self._of: dict[str, _Onsets] = {}
 
     def reset(self) -> None:
         """Forget all evidence."""
-        self._of = {name: _Mount(np.zeros((self._states, 3))) for name in self._of}
+        self._of.clear()
 
     def move(self, A: FloatArray, D: FloatArray) -> None:
         """Follow a motion by its derivatives; see `transition`."""
-        for mount in self._of.values():
-            mount.M[:3] = A @ mount.M[:3] + D @ mount.M[3:]
+        for one in self._of.values():
+            one.M[:, :3] = A @ one.M[:, :3] + D @ one.M[:, 3:]
 
-    def take(self, H: FloatArray, W: FloatArray, w: FloatArray, gain: FloatArray, rows: Sequence[str]) -> None:
+    def take(
+        self, stamp_ns: int, H: FloatArray, W: FloatArray, w: FloatArray, gain: FloatArray, rows: Sequence[str]
+    ) -> None:
         """Add the evidence of the sightings of a keyframe.
 
         Args:
+            stamp_ns: of them.
             H: ``(d, 3 + n)`` by pose and installation.
             W: ``(d, d)`` whitening of their innovation.
             w: ``(d,)`` that innovation, white.
@@ -127,34 +161,31 @@ class MountModes:
             rows: sensor of each row; "" of what is of none.
         """
         for name in dict.fromkeys(rows):
-            if name and name not in self._of:
-                self._of[name] = _Mount(np.zeros((self._states, 3)))
+            if name:
+                self._of.setdefault(name, _Onsets(self._states)).begin(stamp_ns)
         of = np.array(rows)
-        for name, mount in self._of.items():
-            G = -(H @ mount.M)
+        for name, one in self._of.items():
+            G = -(H @ one.M)
             own = of == name
-            G[own] -= H[own, :3]
+            G[:, own] -= H[own, :3]
             G = W @ G
-            gap = w - G @ mount.moved
-            before, pull = mount.information, G.T @ gap
-            mount.information = before + G.T @ G
-            step = np.linalg.solve(mount.information, pull)
-            grown = np.linalg.slogdet(mount.information)[1] - np.linalg.slogdet(before)[1]
-            mount.moved = mount.moved + step
-            mount.evidence += float(w @ w - gap @ gap + pull @ step - grown)
-            mount.M += gain @ G
-            if mount.evidence < -self._alarm:  # it was in place; it may be moved from now on
-                mount.M, mount.evidence = np.zeros_like(mount.M), 0.0
-                mount.moved, mount.information = np.zeros(3), np.diag(_KNOCKED**-2.0)
+            Gt = G.transpose(0, 2, 1)
+            gap = w - (G @ one.moved[:, :, None])[:, :, 0]
+            before, pull = one.information, (Gt @ gap[:, :, None])[:, :, 0]
+            one.information = before + Gt @ G
+            step = np.linalg.solve(one.information, pull[:, :, None])[:, :, 0]
+            grown = np.linalg.slogdet(one.information)[1] - np.linalg.slogdet(before)[1]
+            one.moved = one.moved + step
+            one.evidence = one.evidence + float(w @ w) - (gap * gap).sum(1) + (pull * step).sum(1) - grown
+            one.M += gain @ G
 
-    def displaced(self, prior: float) -> Iterator[tuple[str, float, FloatArray, FloatArray]]:
-        """Each sensor, the probability that its mounting has changed, and what that does to the pose.
-
-        As `LandmarkModes.displaced`.
-        """
-        for name, mount in self._of.items():
-            M, spread = mount.M[:3], np.linalg.inv(mount.information)
-            yield name, _share(prior, mount.evidence), M @ mount.moved, np.diag(M @ spread @ M.T)
+    def displaced(self) -> Iterator[tuple[str, float, FloatArray, FloatArray]]:
+        """Each sensor and onset, the probability of it, and what it does to the pose; as `LandmarkModes.displaced`."""
+        for name, one in self._of.items():
+            M, spread = one.M[:, :3], np.linalg.inv(one.information)
+            for k, prior in enumerate(one.prior.tolist()):
+                share = _share(prior, float(one.evidence[k]))
+                yield name, share, M[k] @ one.moved[k], np.diag(M[k] @ spread[k] @ M[k].T)
 
 
 def _share(prior: float, evidence: float) -> float:
@@ -195,7 +226,7 @@ class LandmarkModes:
         self._information = np.zeros((n, 2, 2))  # on δ, of independent sightings of itself
         self._last_ns: dict[int, int] = {}
         self.displacements: dict[int, FloatArray] = {}
-        self.mounts = MountModes(3 + len(factors.installation), self.alarm)
+        self.mounts = MountModes(3 + len(factors.installation))
         self._returned: dict[int, float] = {}  # evidence that a landmark which is left out is in place
         self.restart()
 
@@ -357,7 +388,7 @@ class LandmarkModes:
         gain = P @ found.H.T @ W.T
         self._M += gain @ G
         sensors = [m.row_kind if m.of_landmark else "" for m, part in zip(seen, parts, strict=True) for _ in w[part]]
-        self.mounts.take(found.H, W, w, gain, sensors)
+        self.mounts.take(seen[0].stamp_ns, found.H, W, w, gain, sensors)
 
     def _contradicted(self, P: FloatArray, belief: PoseWithCovariance, m: LandmarkMeasurement) -> None:
         """A sighting that was rejected; how its own landmark's displacement explains it may be far from linear."""

@@ -80,7 +80,8 @@ class Association:
         named, nameless = self._naming.name(hits, predicted) if hits else ([], [])
         measurements = [*(m for m in measurements if not m.unnamed), *named] if hits else measurements
         judged = self._judge(measurements, predicted)
-        here = self._corrected([m for m, row in zip(measurements, judged, strict=True) if not row[2]], predicted)
+        fits = [m for m, (*_, reason) in zip(measurements, judged, strict=True) if not reason]
+        here = self._corrected([m for m in fits if not self.modes.excludes(m.landmark_id)], predicted)
         measurements, judged = self._revise(measurements, judged, predicted, here)
         shared = [self._share_information(m) for m in measurements]
         for alone, (m, weight), (nis, dof, gate) in zip(measurements, shared, judged, strict=True):
@@ -248,8 +249,8 @@ class Association:
             return [(math.nan, 0, self._seen_too_seldom(m)) for m in measurements]
         if not measurements:
             return []
-        lines = self._factors.linearize(measurements, predicted.pose)
         known = predicted.installation or self._factors.estimated
+        lines = self._factors.observe(measurements).together(predicted.pose, known.mean)
         found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
         uncertain = not is_linear(predicted)
         judged = []
@@ -275,7 +276,11 @@ class Association:
 
         Source: Neira, Tardos 2001, "Data association in stochastic mapping using the joint compatibility test".
         """
-        rows = [i for i, (_, _, reason) in enumerate(judged) if not reason]
+        rows = [
+            i
+            for i, (m, (_, _, reason)) in enumerate(zip(measurements, judged, strict=True))
+            if not reason and not self.modes.excludes(m.landmark_id)
+        ]
         candidates = rows if len(rows) <= MOST_JOINT else sorted(rows, key=lambda i: judged[i][0])[:MOST_JOINT]
         if len(rows) < 2 or (candidates is rows and self._compatible(rows, measurements, predicted)):
             return judged
@@ -284,7 +289,7 @@ class Association:
             others = [i for i in rows if i not in candidates]
             most = [*most, *self._agreeing_with(most, others, measurements, predicted)[1]]
         return [
-            (nis, dof, reason or ("" if i in most or not most else "contradicts_others"))
+            (nis, dof, reason or ("contradicts_others" if most and i in rows and i not in most else ""))
             for i, (nis, dof, reason) in enumerate(judged)
         ]
 

@@ -218,10 +218,9 @@ class Estimator(ABC):
         known, cross = (None, None) if self.belief is None else (self.belief.installation, self.belief.cross)
         if known is None or cross is None:
             return
-        prior = self.installation.prior()
-        for name, (value, sigma) in self.contradicted.items():
-            i = self.installation.index[name]
-            gain = cross[:, i] / known.cov[i, i]
+        prior, rows = self.installation.prior(), [self.installation.index[name] for name in self.contradicted]
+        gains = np.linalg.solve(known.cov[np.ix_(rows, rows)], cross[:, rows].T) if rows else ()
+        for (name, (value, sigma)), i, gain in zip(self.contradicted.items(), rows, gains, strict=True):
             yield name, gain * (value - prior.mean[i]), np.square(gain * sigma)
 
     def _hold_beyond_gate(self, belief: PoseWithCovariance) -> bool:
