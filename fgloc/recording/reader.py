@@ -127,6 +127,7 @@ def converters_of(role: Role) -> Mapping[str, Converter]:
 
 # --- Roles of topics, by message type: what is ambiguous is named, never guessed silently -----------------------------
 
+OWN = "/fgloc/"  # topics below are outputs of fgloc: of `fgloc live`, of this process or another, or of a finished run
 _CAMERA_INFO = ("camera_info",)  # its usual name
 # Words (between / and _) by which a topic says what it is.
 TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack", "vrpn", "qualisys"})
@@ -204,6 +205,10 @@ def select_roles(
         else:
             notes.append(_unnamed(role, filled))
     notes.append(_one_of_images_and_sightings(roles, config))
+    poses = [topic for topic in filled if topic.message_type in converters_of("truth")]
+    own = [topic.name for topic in poses if topic.name.startswith(OWN) and topic.name not in roles.values()]
+    if own:
+        notes.append(f"{', '.join(own)}: the output of a run of fgloc, which is not read.")
     notes += [_empty(role, topics) for role in role_names() if role not in roles and config.given(role) is None]
     return Selection(roles, tuple(note for note in notes if note), tuple(problems))
 
@@ -229,6 +234,10 @@ def _given_roles(
             problems.append(f"{topic_key(role)}: {given} is given for another role too; choose one of them")
         else:
             roles[role] = given
+    if len(problems) > 1 and not roles:
+        problems.append(
+            "no topic of the configuration fits: if it is another robot's, `fgloc init BAG` writes this one's"
+        )
     return roles, problems, notes
 
 
@@ -250,7 +259,7 @@ def _unnamed(role: Role, filled: Iterable[TopicInfo]) -> str:
     if role not in ("image", "truth"):
         return ""
     fitting = converters_of(role).keys() - converters_of("odometry").keys()
-    by_type = [topic.name for topic in filled if topic.message_type in fitting]
+    by_type = [t.name for t in filled if t.message_type in fitting and not t.name.startswith(OWN)]
     if not by_type:
         return ""
     return (
@@ -290,6 +299,8 @@ def _by_dependence(role: Role) -> int:
 
 def _fits(role: Role, topic: TopicInfo) -> bool:
     role = base_role(role)
+    if topic.name.startswith(OWN):  # a run would be fed with, or held against, itself
+        return False
     if topic.message_type not in converters_of(role):
         return False
     if role == "truth":
@@ -331,7 +342,7 @@ def _misfit(role: Role, given: str, topics: Iterable[TopicInfo]) -> str:
     """Reason why a topic that is configured under a key does not fit; empty if it fits."""
     types = converters_of(role)
     found = next((topic for topic in topics if topic.name == given), None)
-    fitting = [topic.name for topic in topics if topic.message_type in types and topic.count > 0]
+    fitting = [topic.name for topic in topics if topic.count > 0 and topic.message_type in types and _fits(role, topic)]
     remedy = f"choose {' or '.join(fitting)}" if fitting else f"the recording has no topic for the {role}: use none"
     if found is None:
         return f"{topic_key(role)}: {given} is not in the recording; {remedy}"

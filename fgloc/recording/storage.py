@@ -95,6 +95,8 @@ def _inside(path: Path, name: Any) -> str:
 
 _KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
 _MOST_NAMED = 5
+_WHOLE = 0.005  # share of a file's bytes: where so few are lost, it was cut off, or only its index is damaged
+_CUT = "; if it was cut off, what came after is missing"
 EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
 
 
@@ -161,7 +163,7 @@ def kind_of(path: Path) -> str:
     """
     suffix = path.suffix if path.suffix != ".zstd" else path.with_suffix("").suffix
     if suffix not in _KINDS:
-        raise RecordingError(f"{path}: unknown kind {suffix!r}; {EXPECTED}")
+        raise RecordingError(f"{path}: unknown kind {suffix!r}; {EXPECTED} (fgloc convert reads some public data sets)")
     return _KINDS[suffix]
 
 
@@ -390,7 +392,7 @@ class _File:
         self.reader = reader
         self._note(
             f"{self._path.name} is damaged ({reason}): salvaged {recovered.messages} messages, "
-            f"{recovered.lost:.1%} of its bytes are lost."
+            f"{recovered.lost:.1%} of its bytes are lost{_CUT if recovered.lost < _WHOLE else ''}."
         )
 
     def _note(self, text: str) -> None:

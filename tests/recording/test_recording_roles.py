@@ -117,6 +117,24 @@ def test_configured_topics_that_do_not_fit(given, message):
     assert re.search(message, selection.problems[0])
 
 
+def test_own_output_is_neither_odometry_nor_truth_unless_it_is_asked_for():
+    own = (("/fgloc/odometry", ODOMETRY), ("/fgloc/pose", COVARIANCE), ("/fgloc/truth", POSE))
+    selection = select(*own)
+    assert (dict(selection.roles), selection.problems) == ({}, ())
+    assert select(("/odom", ODOMETRY), *own).roles == {"odometry": "/odom"}
+    assert select(*own, odometry="/fgloc/odometry").roles == {"odometry": "/fgloc/odometry"}
+
+
+def test_the_configuration_of_another_robot_is_told_as_such():
+    given = {"odometry": "/pioneer/pose", "truth": "/mocap/pose"}
+    problems = select(("/odom", ODOMETRY), ("/imu/data", IMU), **given).problems
+    assert len(problems) == 3
+    assert "choose /odom" in problems[0]
+    assert "/odom" not in problems[1]  # it is what is held against a truth
+    assert "another robot" in problems[2]
+    assert len(select(("/odom", ODOMETRY), ("/imu/data", IMU), odometry="/odom", truth="/mocap/pose").problems) == 1
+
+
 def test_open_recording_refuses_what_is_ambiguous(tmp_path):
     from fgloc_datasets.bag import BagWriter
 

@@ -18,6 +18,7 @@ from weakref import WeakValueDictionary
 from fgloc.errors import WireError
 from fgloc.live.wire.transport import Publication, Received, received_ns
 from fgloc.recording.messages import FieldLayout, Messages
+from fgloc.recording.reader import OWN
 
 if TYPE_CHECKING:
     from cyclonedds.domain import Domain
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 # --- Names of topics and types in DDS ---------------------------------------------------------------------------------
 
-OWN = "/fgloc/"  # topics below are outputs of `fgloc live`, of this process or another
 _TOPIC = "rt/"
 _TYPE_HASH = re.compile(rb"typehash=(RIHS\d\d_[0-9a-f]{64});")
 
