@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
 from fgloc.config import Config, base_role
+from fgloc.diagnosis.truth import truth_sentence
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation.judgements import Judgement, judgements
 from fgloc.results import RunData
@@ -195,6 +196,7 @@ def mean_bounds(dof: int, samples: int, probability: float = 0.95) -> tuple[floa
 _MOST_NEES = 3.0  # NEES/3: errors of √3 = 1.7 times what the covariance says; sound runs as installed stay below 2
 _MOST_DROPPED = 0.2  # share of a sensor's messages
 _FEWEST = 20  # dropped ones
+_ORIGIN = 1e-3  # m and rad: no run on a map begins at its origin so exactly
 _PRIOR = re.compile(r"(position|scale)_sigma")  # of a section's settings, the one that says most of its installation
 _SETTINGS = {  # of a sensor whose messages are dropped
     "odometry": "expert.gate.max_speed, expert.gate.max_yaw_rate or recording.received_stamps",
@@ -214,6 +216,7 @@ def all_findings(
     rejections: Mapping[str, int],
     keyframes: int,
     size: Size | None = None,
+    frame: Finding | None = None,
 ) -> tuple[Finding, ...]:
     """Findings of a run and the warnings by its figures, the gravest first.
 
@@ -223,9 +226,21 @@ def all_findings(
         rejections: rejected items by ``sensor.reason``.
         keyframes: number of poses.
         size: scale against the truth.
+        frame: that the truth is in another frame, which makes errors of what are none.
     """
-    warned = [*_sized(size), *_optimistic(result, nees_over_3), *_dropped(result, rejections, keyframes)]
-    return ordered([*result.findings, *warned])
+    misjudged = [frame] if frame is not None else _optimistic(result, nees_over_3)
+    return ordered([*result.findings, *_sized(size), *misjudged, *_dropped(result, rejections, keyframes)])
+
+
+def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | None:
+    """Finding that the truth is not in the frame of a run whose first pose is the origin, as without a map."""
+    poses = result.trajectory.poses
+    if config.estimator.initial_pose is not None or not np.allclose(poses[0], 0.0, atol=_ORIGIN):
+        return None
+    times = (matched.stamps_ns - matched.stamps_ns[0]) * 1e-9
+    sentence = truth_sentence(config, np.column_stack([times, matched.truth]), times, matched.estimate)
+    lines = {"truth.align": "se2"}
+    return None if sentence is None else Finding("truth.frame", sentence, Severity.WARNING, lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -553,6 +568,7 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
                     dict(sorted(result.rejections.items())),
                     len(stamps),
                     against_truth(size_of),
+                    against_truth(lambda m: _elsewhere(result, config, m)),
                 ),
             )
         ),

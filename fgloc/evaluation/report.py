@@ -104,7 +104,8 @@ _PROTECTION = (
     "by more than their bound; without an alert these are dangerous."
 )
 _NEES = "NEES / 3 (honest: 1)"
-_OF_FINDING = {"covariance.optimistic": _NEES, "truth.size": "mean distance from truth"}  # tile by code
+_AWAY = "mean distance from truth"
+_OF_FINDING = {"covariance.optimistic": _NEES, "truth.size": _AWAY, "truth.frame": _AWAY}  # tile by code
 Row = tuple[str, ...]
 
 
