@@ -22,9 +22,16 @@ _UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millime
 _UNIT = 0.04  # logarithm by which a scale may miss a unit's
 
 
-def unit_of(scale: float, within: float = _UNIT) -> tuple[float, str] | None:
-    """Factor and name of the unit of length that a scale (true over reported) is near; None: no usual one."""
-    units = _UNITS | {1.0 / factor: f"metres for {name}" for factor, name in _UNITS.items()}
+def unit_of(scale: float, within: float = _UNIT, speeds: bool = True) -> tuple[float, str] | None:
+    """Factor and name of the unit that a scale (true over reported) is near; None: no usual one.
+
+    Args:
+        scale: of lengths, or of what is measured in them.
+        within: logarithm by which it may miss the unit's.
+        speeds: whether it may be a unit of speed.
+    """
+    known = {factor: name for factor, name in _UNITS.items() if speeds or "/" not in name}
+    units = known | {1.0 / factor: f"metres for {name}" for factor, name in known.items()}
     factor = min(units, key=lambda unit: abs(math.log(abs(scale) / unit)))
     return (factor, units[factor]) if abs(math.log(abs(scale) / factor)) < within else None
 

@@ -30,6 +30,7 @@ from fgloc.types import Finding, FloatArray, Severity
 
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or mapped by worn wheels
+_MAPPED = 0.2  # logarithm by which distances on a map in another unit may be off besides
 _UNSURE = 0.1  # share of a scale by which it is not known
 _GYRO_SCALE = 0.02  # by which an uncalibrated gyro may be off
 _TURNED_RAD = 0.05  # of a sensor: likewise
@@ -331,7 +332,7 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
 def _three(found: Conventions, by_wheels: Figure, on_map: Figure, ranges: Figure) -> None:
     """Name the one of map, ranges and wheels that the other two contradict."""
     inverse = Figure(1.0 / on_map.value, on_map.sigma / on_map.value**2)
-    unit = unit_of(inverse.value)
+    unit = unit_of(inverse.value, _MAPPED, speeds=False)  # what is left, ranges or wheels may be off by
     if not by_wheels.off(1.0, _SCALE):
         if unit is None and abs(math.log(on_map.value)) < _SURVEYED:
             return

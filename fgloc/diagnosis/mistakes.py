@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severit
 
 _MARKER_SHARE = 0.1  # of the images: in fewer, the dictionary or the images may be wrong
 _FEWEST_IMAGES = 5
+_MOST_IDS = 12  # that are named
 _MOST_READINGS = 3  # of the recording, with stamps or mountings corrected in between
 _OF_CAMERA = ("camera", "markers", "setup", "sightings")  # of codes of findings on what a camera sees
 _MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the place is known
@@ -168,7 +169,20 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
             search.go_on(recording, setup, collector.found)
         except FglocError as error:
             return replace(info, problems=(str(error), *info.problems))
-    return replace(info, found=ordered([*search.findings, *info.found]))
+    found = search.findings or _other_ids(info.marker_ids, setup.landmark_map)
+    return replace(info, found=ordered([*found, *info.found]))
+
+
+def _other_ids(seen: Collection[int], landmark_map: LandmarkMap | None) -> list[Finding]:
+    """That the map has none of the landmarks that are seen, which leaves nothing to compare it by."""
+    if not seen or landmark_map is None or any(number in landmark_map for number in seen):
+        return []
+    ids, known = (", ".join(map(str, sorted(n)[:_MOST_IDS])) or "none" for n in (seen, landmark_map.landmarks))
+    text = (
+        f"None of the ids that are seen ({ids}) is in the map, which has {known}: nothing tells where on it the robot "
+        "is. Give the map of these markers, or run without one."
+    )
+    return [Finding("map.other_ids", text, Severity.ERROR)]
 
 
 class _Search:

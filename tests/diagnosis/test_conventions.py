@@ -174,6 +174,12 @@ def test_a_map_that_is_a_little_too_large_has_a_constant_and_no_unit(tmp_path):
     assert not [f for f in conventions_of(record(tmp_path, Broken(map=1.08)), Config()) if f.code.startswith("map.")]
 
 
+@pytest.mark.parametrize(("factor", "scale"), [(926.0, "0.001"), (108.0, "0.01"), (3.0, "0.3048"), (37.0, "0.0254")])
+def test_a_map_in_another_unit_keeps_it_where_the_rest_is_off_too(tmp_path, factor, scale):
+    (found,) = [f for f in conventions_of(record(tmp_path, Broken(map=factor)), Config()) if f.code == "map.unit"]
+    assert found.lines == {"map.scale": scale}
+
+
 def test_a_range_bias_in_another_unit_than_the_ranges_hides_no_unit(tmp_path):
     config = Config.model_validate({"landmarks": {"range_bias_m": 0.08}})
     found = conventions_of(record(tmp_path, Broken(range=0.001)), config)
