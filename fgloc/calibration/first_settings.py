@@ -349,6 +349,6 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
         yield f"  align: {'none' if seen.has_map else 'se2'}"
     else:
         missing.append(
-            "no truth: to train, smooth the recordings first (their trajectories are the truth); there will be no "
-            "errors in the reports"
+            "no truth: the reports cannot tell how far off the poses are; to train, smooth the recordings first (their "
+            "trajectories are the truth)"
         )

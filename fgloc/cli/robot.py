@@ -69,7 +69,7 @@ def init(
     say_table(("role", "topic"), list(found.roles.items()))
     for finding in found.found:
         if finding.lines:
-            say(f"found: {finding.text.replace(': set ', '; written: ', 1)}")
+            say(f"found: {finding.text.replace(': set ', '; written: ', 1).replace('; set ', ', ')}")
     for sentence in found.missing:
         warn(sentence)
     say(f"configuration: {out}")
