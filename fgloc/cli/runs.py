@@ -44,6 +44,7 @@ from fgloc.cli.terminal import (
     say_remark,
     say_table,
     typed,
+    warn,
 )
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
@@ -119,7 +120,9 @@ def smooth(
     spare_inputs(out, bag, map_file, config, force)
     say_inputs(bag, map_file, config)
     result = _localize(bag, map_file, configured(bag, config, model), out, "batch")
-    _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
+    metrics = _write(result, bag, out, typed(), forms)
+    with kept_on_interrupt(f"the result in {out} is whole"):
+        _finish(result, metrics, out, rrd, mcap)
 
 
 def online(
@@ -140,7 +143,9 @@ def online(
     spare_inputs(out, bag, map_file, config, force)
     say_inputs(bag, map_file, config)
     result = _localize(bag, map_file, configured(bag, config, model), out, "online", pace)
-    _finish(result, _write(result, bag, out, typed(), forms), out, rrd, mcap)
+    metrics = _write(result, bag, out, typed(), forms)
+    with kept_on_interrupt(f"the result in {out} is whole"):
+        _finish(result, metrics, out, rrd, mcap)
 
 
 def _say_inputs_of_many(map_file: Path | None, config_file: Path | None) -> None:
@@ -425,7 +430,7 @@ def compare(
     ] = None,
 ) -> None:
     """Compare finished runs of one recording. All distances are from the first one's poses."""
-    from fgloc.evaluation.compare import HEAD, plot_comparison
+    from fgloc.evaluation.compare import HEAD, plot_comparison, remarks
     from fgloc.evaluation.compare import compare as held
     from fgloc.evaluation.style import FORMATS, image_of
     from fgloc.files.outputs import write_bytes
@@ -437,6 +442,8 @@ def compare(
         raise typer.BadParameter(f"{figure.name!r} does not end in .png, .svg or .pdf", param_hint="--figure")
     runs = held(folders)
     say_table(HEAD, [run.row() for run in runs])
+    for sentence in remarks(runs):
+        warn(sentence)
     if figure is not None and form is not None:
         check_out(figure, folder=False)
         write_bytes(figure, image_of(plot_comparison(runs), form))

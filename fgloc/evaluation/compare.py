@@ -31,7 +31,10 @@ HEAD = (
     "apart [m]",
 )
 _COLORS = (BLUE, RED, GREEN, ORANGE, SKY)
+_DASHES = ("-", "--", ":", "-.")  # of the runs beyond as many
 _BRIDGED_S = 1.0  # between two poses of the first run
+_FRAME_M = 0.2  # distance between two runs above which their frames are asked about
+_ALIGNED = 0.2  # share of it that may remain where the frames differ
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +86,30 @@ def _held(name: str, one: Results, first: Results) -> Compared:
     return Compared(name, one, _truth(one), own.stamps_ns[k], apart)
 
 
+def remarks(runs: Sequence[Compared]) -> list[str]:
+    """Sentences on runs whose distance from the first one is none of their estimates."""
+    first, found = runs[0], []
+    base = first.results.trajectory
+    for run in runs[1:]:
+        if not len(run.apart):
+            found.append(f"{run.name} and {first.name} share no time: they are of different recordings.")
+            continue
+        own = run.results.trajectory
+        here = own.poses[np.searchsorted(own.stamps_ns, run.apart_ns)]
+        there = se2.interpolate(base.stamps_ns, base.poses, run.apart_ns)
+        T = se2.rigid_if_spread(here[:, :2], there[:, :2])
+        if T is None:
+            continue
+        moved = se2.compose_array(T, here)
+        left, apart = (float(np.sqrt(np.mean(a**2))) for a in (np.hypot(*(moved - there)[:, :2].T), run.apart))
+        if apart > _FRAME_M and left < _ALIGNED * apart:
+            found.append(
+                f"{run.name} and {first.name} are in different frames, as with and without a map: of {apart:.3g} m "
+                f"apart {left:.3g} m are left once one is moved rigidly onto the other (fgloc evaluate --align se2)."
+            )
+    return found
+
+
 def _truth(one: Results) -> Trajectory | None:
     """Truth beside a run, in the frame in which the run compared it."""
     path = one.folder / "truth.tum"
@@ -119,10 +146,11 @@ def plot_comparison(runs: Sequence[Compared]) -> Figure:
         xy = broken(truth.stamps_ns, truth.poses[:, :2])
         handles += way.plot(*xy.T, color=GREY, lw=3.0, alpha=0.5, label="truth")
     start = min(int(run.results.trajectory.stamps_ns[0]) for run in runs)
-    for run, color in zip(runs, (_COLORS[i % len(_COLORS)] for i in range(len(runs))), strict=True):
+    for i, run in enumerate(runs):
+        color, dashes = _COLORS[i % len(_COLORS)], _DASHES[i // len(_COLORS) % len(_DASHES)]
         own = run.results.trajectory
         handles += way.plot(
-            *broken(own.stamps_ns, own.poses[:, :2]).T, color=color, lw=1.2, label=plain_label(run.name)
+            *broken(own.stamps_ns, own.poses[:, :2]).T, color=color, ls=dashes, lw=1.2, label=plain_label(run.name)
         )
         stamps, off = run.apart_ns, run.apart
         if run.truth is not None and len(k := matchable(own, run.truth, _BRIDGED_S)):
@@ -130,7 +158,7 @@ def plot_comparison(runs: Sequence[Compared]) -> Figure:
             stamps, off = own.stamps_ns[k], np.hypot(*(own.poses[k] - true)[:, :2].T)
         if len(stamps):
             times = broken(stamps, np.column_stack([(stamps - start) * 1e-9, off]))
-            error.plot(*times.T, color=color, lw=1.0)
+            error.plot(*times.T, color=color, ls=dashes, lw=1.0)
     way.set_aspect("equal", adjustable="datalim")
     way.set_xlabel("x [m]", fontsize=NORMAL)
     way.set_ylabel("y [m]", fontsize=NORMAL)

@@ -37,13 +37,13 @@ FILES = {
 FILES_OF = {"batch": FILES, "smooth": FILES, "online": FILES | {"protection.csv"}}
 
 
-def write_circle(folder, seconds=10.0, sees=True, truth=True):
+def write_circle(folder, seconds=10.0, sees=True, truth=True, start_ns=START_NS):
     """A robot on a circle that sees four beacons, or none; ``bag`` with ``map.yaml`` beside it."""
     rng = np.random.default_rng(3)
     pose, odometry = np.array([1.0, 0.0, math.pi / 2]), np.zeros(3)
     with BagWriter(folder / "bag") as bag:
         for k in range(round(seconds * 20)):
-            stamp = START_NS + k * 50_000_000
+            stamp = start_ns + k * 50_000_000
             bag.odometry("/odom", stamp, odometry, (0.4, 0.4))
             if truth:
                 bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))

@@ -207,6 +207,19 @@ def test_ctrl_c_says_what_is_kept(bag, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
+def test_ctrl_c_after_the_result_was_written_says_that_it_is_whole(bag, tmp_path, monkeypatch):
+    monkeypatch.setattr("fgloc.cli.runs.say_table", lambda *_: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code, _, err = fgloc("online", bag, "--out", tmp_path / "out")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert code == 130
+    assert err.startswith("interrupted: ")
+    assert "nothing was written" not in err
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
 # --- findings ---------------------------------------------------------------------------------------------------------
 
 
@@ -447,6 +460,41 @@ def test_finished_runs_are_compared_with_each_other_and_with_the_truth(bag, tmp_
             code, _, err = fgloc(*command)
             assert code == 1
             assert f"{tmp_path / 'a'}: written by a newer fgloc (format {later!r}" in err
+
+
+def test_distances_between_frames_or_recordings_are_told_as_such(bag, tmp_path):
+    other = write_circle(tmp_path, seconds=5.0, start_ns=START_NS + 60_000_000_000)
+    free = tmp_path / "alone" / "bag"  # without a map beside it
+    free.parent.mkdir()
+    free.symlink_to(bag, target_is_directory=True)
+    runs = {"a": (bag, "--map", bag.parent / "map.yaml"), "free": (free,), "other": (other,)}
+    for name, arguments in runs.items():
+        fgloc("smooth", *arguments, "--out", tmp_path / name)
+    assert fgloc("compare", tmp_path / "a", tmp_path / "a")[2] == ""
+    for name in ("free", "other"):
+        code, _, err = fgloc("compare", tmp_path / "a", tmp_path / name)
+        assert code == 0
+        assert len(err.splitlines()) == 1
+        assert err.startswith(f"warning: {name} and a ")
+
+
+def test_a_truth_in_another_frame_is_named_and_blames_no_covariance(tmp_path):
+    bag = write_circle(tmp_path, seconds=15.0)
+    (tmp_path / "map.yaml").unlink()
+    for align, codes in (("none", {"truth.frame"}), ("se2", set())):
+        (tmp_path / "robot.yaml").write_text(f"truth: {{align: {align}}}\n")
+        assert fgloc("smooth", bag, "--out", tmp_path / align)[0] == 0
+        findings = json.loads((tmp_path / align / "metrics.json").read_text())["findings"]
+        assert {f["code"] for f in findings if f["severity"] != "note"} == codes
+        assert [f["lines"] for f in findings if f["code"] == "truth.frame"] == [{"truth.align": "se2"}] * len(codes)
+
+
+def test_info_names_a_map_of_other_markers(bag, tmp_path):
+    (tmp_path / "map.yaml").write_text("landmarks:\n  - {id: 90, position: [1, 2]}\n  - {id: 91, position: [4, 2]}\n")
+    code, out, _ = fgloc("info", bag, "--map", tmp_path / "map.yaml")
+    assert code == 3
+    assert "90, 91" in out
+    assert fgloc("info", bag, "--map", bag.parent / "map.yaml")[0] == 0
 
 
 @pytest.mark.parametrize("arguments", [("a",), ("a", "b", "--figure", "both.txt")])
