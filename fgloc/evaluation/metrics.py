@@ -318,9 +318,12 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
         if count >= _FEWEST and count > _MOST_DROPPED * max(received, count):
             reasons = ", ".join(f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}."))
             too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
-            unit = " Angles that change so fast are ticks or degrees, not radians." if 2 * too_fast > count else ""
+            unit, settings = "", _SETTINGS[kind]
+            if 2 * too_fast > count:
+                unit = " Angles that change so fast are ticks or degrees, not radians."
+                settings = "wheels.drive and its ticks_per_turn (docs/drives.md)"
             used = sensor not in _MOTION or result.found is None or result.found.wheels in ("", sensor)
-            remedy = f"look at {_SETTINGS[kind]}" if used else "the run's motion is of another source"
+            remedy = f"look at {settings}" if used else "the run's motion is of another source"
             yield Finding(
                 f"{sensor}.dropped",
                 f"{count} messages of {sensor} were dropped ({reasons}); {remedy}.{unit}",
