@@ -192,7 +192,7 @@ class ProtectionLevels:
             faults.append(_Fault("place", share, np.zeros(3), _ELSEWHERE))
         if held := list(as_seen):  # beside each of the others, too
             off = _Fault(
-                ", ".join(name for name, *_ in held),
+                " + ".join(name for name, *_ in held),
                 1.0,
                 np.sum([np.abs(mean) for _, mean, _ in held], axis=0),
                 _OVERBOUND**2 * np.sum([spread for *_, spread in held], axis=0),
