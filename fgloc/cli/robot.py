@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence, Set
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +11,7 @@ import typer
 
 from fgloc.cli.options import Bag, Bags, ConfigOption, ForceOption, MapOption, ModelOption, configured, spare_inputs
 from fgloc.cli.terminal import (
+    EXIT_LOST,
     ask,
     asks,
     exit_unless_trusted,
@@ -16,12 +19,13 @@ from fgloc.cli.terminal import (
     run_bar,
     say,
     say_inputs,
+    say_remark,
     say_table,
     shown_path,
     typed,
     warn,
 )
-from fgloc.errors import ConfigError, MapError, OutputError, RecordingError
+from fgloc.errors import ConfigError, FglocError, MapError, OutputError, RecordingError
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
@@ -231,6 +235,24 @@ def _distance(text: str) -> Distance:
 # --- calibrate --------------------------------------------------------------------------------------------------------
 
 
+def _bending(bags: Sequence[Path], map_file: Path | None, config: Config, fitted: Set[str]) -> list[str]:
+    """Mistakes of the set-up that no fitted constant can undo, where no map tells them from what the wheels are off."""
+    from fgloc.diagnosis.mistakes import find_mistakes
+    from fgloc.recording.storage import find_beside
+    from fgloc.types import Severity
+
+    texts = []
+    for bag in bags:
+        if map_file is not None or find_beside(bag, "map.yaml") is not None:
+            continue
+        with suppress(FglocError):  # a recording that calibrates the wheels alone, by its truth, need not be one to run
+            for finding in find_mistakes(bag, None, config).findings:
+                keys = {key.removeprefix("expert.") for key in finding.lines}
+                if finding.severity is Severity.ERROR and not (keys and keys <= fitted):
+                    texts.append(f"{bag}: {finding.text}" if len(bags) > 1 else finding.text)
+    return texts
+
+
 def calibrate(
     bags: Bags,
     out: Annotated[
@@ -243,6 +265,7 @@ def calibrate(
     """Calibrate wheels, camera and clocks. From recordings on a known map, or in which landmarks are seen again.
 
     Recordings without landmarks but with a truth calibrate the wheels alone: their motion is compared with the truth.
+    Exit code 3: without a map, something else of the set-up is wrong, and the constants are bent by it.
     """
     from fgloc.calibrate import calibrate as calibrated
     from fgloc.calibration.installation import found_text, given_text, setting_unit
@@ -259,6 +282,11 @@ def calibrate(
     rows = [(s.name, setting_unit(s.name), given_text(s), found_text(s)) for s in settings]
     say_table(("setting", "unit", "given", "found"), rows)
     say(f"configuration: {out}")
+    if wrong := _bending(bags, map_file, before, {s.name for s in settings}):
+        for text in wrong:
+            say_remark("error", text, err=True)
+        say("not to be trusted: what is wrong there was fitted by the constants above; correct it first", err=True)
+        raise typer.Exit(EXIT_LOST)
     paths = " ".join(shown_path(bag) for bag in bags)
     next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")
     next_step(f"fgloc smooth {shown_path(bags[-1])} --config {shown_path(out)} --out result", "the best estimate")

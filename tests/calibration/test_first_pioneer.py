@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from command_line import fgloc
 from rosbags.rosbag1 import Writer
 
 from fgloc.calibration.first_settings import RobotFile, first_settings
-from fgloc.config import Config, config_of_file
+from fgloc.config import Config, config_of_file, load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.messages import default_typestore
 from fgloc.recording.reader import open_recording
@@ -142,3 +143,16 @@ def test_the_robot_is_where_it_drove(source: Path, config: Config) -> None:
     metrics = compute_metrics(run(source, None, config, "batch"), config)
     assert metrics.ate_rmse_m is not None
     assert metrics.ate_rmse_m < 0.02
+
+
+def test_calibrate_tells_what_bends_the_wheels(source: Path, found: RobotFile, tmp_path: Path) -> None:
+    """Ranges that are too long: without a map the wheels take them up, and are wrong by as much."""
+    content = yaml.safe_load(found.text)
+    for name, scaled, code in (("sound", True, 0), ("wrong", False, 3)):
+        if not scaled:
+            del content["expert"]["landmarks"]["range_scale"]
+        robot = tmp_path / f"{name}.yaml"
+        robot.write_text(yaml.safe_dump(content))
+        assert fgloc("calibrate", source, "--config", robot, "--out", tmp_path / f"{name}-found.yaml")[0] == code
+    off = load_config(tmp_path / "wrong-found.yaml").wheels.scale_v
+    assert off == pytest.approx(1.0 / _SCALE, rel=0.1)  # what is told
