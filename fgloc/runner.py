@@ -21,7 +21,7 @@ from fgloc.errors import EstimatorError
 from fgloc.evaluation.report import write_results
 from fgloc.graph.contradictions import Contradiction
 from fgloc.instrumentation import one_blas_thread, working
-from fgloc.recording.info import unread_map
+from fgloc.recording.info import unread_map, unused_positions
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
 from fgloc.results import RunData
@@ -66,6 +66,7 @@ class Outcome:
                 "map.unused", () if unread is None or parts.config.estimator.initial_pose else (unread,), Severity.ERROR
             ),
             *wrong.findings,
+            *note("positions.unused", unused_positions(recording, parts.config), Severity.WARNING),
             *note("floor.uneven", map(sentence, parts.diagnosis.mistakes), Severity.ERROR),
             *note("sightings.unused", map(sentence, unused), Severity.ERROR),
             *note("motion.model", map(sentence, parts.localizer.motion.mistakes), Severity.ERROR),

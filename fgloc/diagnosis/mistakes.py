@@ -169,8 +169,8 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
             search.go_on(recording, setup, collector.found)
         except FglocError as error:
             return replace(info, problems=(str(error), *info.problems))
-    found = search.findings or _other_ids(info.marker_ids, setup.landmark_map)
-    return replace(info, found=ordered([*found, *info.found]))
+    named = list(search.findings) or _other_ids(info.marker_ids, setup.landmark_map)
+    return replace(info, found=ordered([*named, *info.found]))
 
 
 def _other_ids(seen: Collection[int], landmark_map: LandmarkMap | None) -> list[Finding]:

@@ -418,6 +418,18 @@ def unread_map(recording: Recording, config: Config) -> str | None:
     )
 
 
+def unused_positions(recording: Recording, config: Config) -> list[str]:
+    """Sentences on topics of positions or ranges that lack a setting, of a run that nothing else places."""
+    if placing_roles(recording.roles, config):
+        return []
+    lacking, counts = _lacking(config), {t.name: t.count for t in recording.topics}
+    return [
+        f"{topic} is not used, and nothing else tells where the robot is: give {lacking[role]} in robot.yaml."
+        for role, topic in recording.roles.items()
+        if role in lacking and counts.get(topic)
+    ]
+
+
 def _unused(recording: Recording, config: Config) -> list[str]:
     """Sentences on topics that hold the robot's position, and that nothing reads, or nothing as it is configured."""
     lacking, found = _lacking(config), []

@@ -205,8 +205,8 @@ def select_roles(
         else:
             notes.append(_unnamed(role, filled))
     notes.append(_one_of_images_and_sightings(roles, config))
-    poses = [topic for topic in filled if topic.message_type in converters_of("truth")]
-    own = [topic.name for topic in poses if topic.name.startswith(OWN) and topic.name not in roles.values()]
+    told = [topic.name for topic in filled if topic.message_type in converters_of("truth")]
+    own = [name for name in told if name.startswith(OWN) and name not in roles.values()]
     if own:
         notes.append(f"{', '.join(own)}: the output of a run of fgloc, which is not read.")
     notes += [_empty(role, topics) for role in role_names() if role not in roles and config.given(role) is None]

@@ -13,9 +13,10 @@ import pytest
 from real_data import real_data
 from recording_bags import START_NS, TICK_NS, write_drive, write_ros1
 
-from fgloc.config import Config
+from fgloc.config import Config, config_of
 from fgloc.errors import RecordingError
 from fgloc.recording.info import RecordingInfo, format_info, inspect
+from fgloc.runner import run
 from fgloc_datasets.bag import BagWriter
 
 CONFIG = Config()
@@ -246,3 +247,17 @@ def test_real_recordings(parts, words):
     info = inspect(real_data(*parts), CONFIG)
     one(info, *words)
     assert len(format_info(info).splitlines()) > 8
+
+
+@pytest.mark.parametrize(("origin", "beside"), [(None, False), ([48.0, 11.0, 500.0], False), (None, True)])
+def test_a_run_says_that_positions_are_not_used_where_nothing_else_places_it(tmp_path, origin, beside):
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(60):
+            stamp = START_NS + k * TICK_NS
+            bag.odometry("/odom", stamp, (0.05 * k, 0, 0), (1, 0), covs=(np.eye(6) * 1e-3, np.eye(6) * 1e-3))
+            bag.satellite_fix("/fix", stamp, (48.0, 11.0 + 6.7e-7 * k, 500.0), (1.0, 1.0, 4.0))
+            if beside:
+                bag.range_bearing("/seen", stamp, [(7, 2.0, 0.0)])
+    config = config_of({"estimator": {"initial_pose": [0, 0, 0]}} | ({"gnss": {"origin": origin}} if origin else {}))
+    codes = [finding.code for finding in run(tmp_path / "run", None, config, "online").findings]
+    assert ("positions.unused" in codes) == (origin is None and not beside)
