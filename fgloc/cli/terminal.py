@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 EXIT_BAD_INPUT = 1
 EXIT_LOST = 3
 EXIT_INTERRUPTED = 130
-_MAPPED = "none: landmarks are estimated with the trajectory"
+_MAPPED = "none: landmarks that are seen are estimated with the trajectory"
 
 
 def say(text: str, err: bool = False, nl: bool = True) -> None:

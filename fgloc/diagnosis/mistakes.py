@@ -97,7 +97,7 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
         now, landmark_map = now.with_camera(name, found.config), found.landmark_map
     undone = now != config or landmark_map is not None
     if undone and any(finding.severity is Severity.ERROR for finding in findings):
-        findings += note("setup.corrected", ["This run was made with that corrected; correct it, too."])
+        findings += note("setup.corrected", ["This run was made as if the lines above were set: set them."])
     return Mistakes(tuple(findings), now, landmark_map, undone, checked=True)
 
 
