@@ -174,7 +174,7 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
 
 
 def _other_ids(seen: Collection[int], landmark_map: LandmarkMap | None) -> list[Finding]:
-    """That the map has none of the landmarks that are seen, which leaves nothing to compare it by."""
+    """Finding that none of the landmarks that are seen is on the map; empty if one is, or if none is seen."""
     if not seen or landmark_map is None or any(number in landmark_map for number in seen):
         return []
     ids, known = (", ".join(map(str, sorted(n)[:_MOST_IDS])) or "none" for n in (seen, landmark_map.landmarks))

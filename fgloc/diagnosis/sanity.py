@@ -214,7 +214,7 @@ class Sanity:
                 self._seen_ns.append(stamp_ns)
                 self._ids.append(landmark_id)
                 self._seen.extend((place[0], place[1], sigma))
-        return self.watch.checked(step, measured, joined, estimate, list(self._mapped(step, seen)))
+        return self.watch.checked(step, measured, joined, estimate, list(self._surveyed(step, seen)))
 
     def begin_anew(self) -> None:
         """Restart the comparison at the next pose: it was given, and the odometry does not lead there."""
@@ -233,7 +233,7 @@ class Sanity:
                 sigma = math.hypot(sighting.sigma_m, sighting.sigma_rad * math.hypot(place[0], place[1]))
                 yield event.stamp_ns, sighting.landmark_id, place, sigma
 
-    def _mapped(self, step: Step, seen: Sequence[tuple[int, int, FloatArray, float]]) -> Iterator[Placed]:
+    def _surveyed(self, step: Step, seen: Sequence[tuple[int, int, FloatArray, float]]) -> Iterator[Placed]:
         """Sightings of landmarks of a known map, in the base frame at the step's stamp."""
         if self._landmarks is None:
             return

@@ -108,19 +108,19 @@ class _Onsets:
         """Add a hypothesis that begins now; the least probable of the others goes if there are too many."""
         prior = _WRONG_FROM_THE_START
         if self.last_ns is not None:
-            prior = max(stamp_ns - self.last_ns, 0) * 1e-9 * _KNOCKS_PER_S
+            prior = -math.expm1(-max(stamp_ns - self.last_ns, 0) * 1e-9 * _KNOCKS_PER_S)
         self.last_ns = stamp_ns
         if prior == 0.0:
             return
         if len(self.prior) == _MOST_ONSETS:
-            self._keep(1 + int(np.argmin(self.evidence[1:] + 2.0 * np.log(self.prior[1:]))))
+            self._drop(1 + int(np.argmin(self.evidence[1:] + 2.0 * np.log(self.prior[1:]))))
         self.M = np.concatenate([self.M, np.zeros((1, *self.M.shape[1:]))])
         self.moved = np.concatenate([self.moved, np.zeros((1, 3))])
         self.information = np.concatenate([self.information, np.diag(_KNOCKED**-2.0)[None]])
         self.evidence, self.prior = np.append(self.evidence, 0.0), np.append(self.prior, prior)
 
-    def _keep(self, without: int) -> None:
-        kept = np.arange(len(self.prior)) != without
+    def _drop(self, k: int) -> None:
+        kept = np.arange(len(self.prior)) != k
         self.M, self.moved, self.information = self.M[kept], self.moved[kept], self.information[kept]
         self.evidence, self.prior = self.evidence[kept], self.prior[kept]
 
@@ -188,9 +188,12 @@ class MountModes:
                 yield name, share, M[k] @ one.moved[k], np.diag(M[k] @ spread[k] @ M[k].T)
 
 
+_SURE = 1.0 - 1e-12
+
+
 def _share(prior: float, evidence: float) -> float:
     """Probability of a hypothesis by its prior, and twice the log-likelihood ratio to its contrary."""
-    odds = math.log(prior) - math.log1p(-prior) + 0.5 * min(max(evidence, -1e3), 1e3)
+    odds = math.log(prior) - math.log1p(-min(prior, _SURE)) + 0.5 * min(max(evidence, -1e3), 1e3)
     return 1.0 / (1.0 + math.exp(-odds))
 
 

@@ -207,7 +207,7 @@ class MotionCompensation:
         return (motion if turned is None else np.array([*motion[:2], turned])), cov
 
     def _turned(self, gyro: Gyro, step: Step, at_ns: int) -> float | None:
-        """Turn ``(T_keyframe_then)`` [rad] by the gyro; None: it was silent in that time."""
+        """Yaw of ``T_keyframe_then`` [rad] by the gyro; None: it was silent for some of that time."""
         events = step.inertial
         if not events:
             return None
@@ -215,8 +215,7 @@ class MotionCompensation:
             return float(gyro.rates_at(events, (at_ns,))[0] * (at_ns - step.stamp_ns) * 1e-9)
         first, last = sorted((at_ns, step.stamp_ns))
         nodes = [first, *(e.stamp_ns for e in events if first < e.stamp_ns < last), last]
-        covered = [*nodes[:-1], min(last, events[-1].stamp_ns)]
-        if events[0].stamp_ns > first + _SHORT_NS or np.diff([*covered, last]).max() > _SHORT_NS:
+        if np.diff(nodes).max() > _SHORT_NS:
             return None
         turn = float(np.trapezoid(gyro.rates_at(events, tuple(nodes)), np.array([n - first for n in nodes]) * 1e-9))
         return turn if at_ns > step.stamp_ns else -turn

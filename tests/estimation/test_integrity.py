@@ -102,6 +102,21 @@ def test_a_camera_that_was_knocked_moves_the_pose_that_it_alone_tells():
     assert 0.05 < found.bound[2] < 0.3
 
 
+def test_a_camera_may_have_been_knocked_while_the_robot_was_parked_in_the_dark():
+    """For an hour, or a year: the longer, the more probable."""
+    shares = []
+    for parked_s in (3600, 365 * 86400, 300 * 365 * 86400):
+        modes, H, W = (
+            MountModes(3),
+            np.eye(3) / 0.001,
+            np.linalg.inv(np.linalg.cholesky(np.diag([1e6] * 3) + np.eye(3))),
+        )
+        for stamp_ns in (0, parked_s * 10**9):
+            modes.take(stamp_ns, H, W, np.zeros(3), H.T @ W.T, ["corners"] * 3)
+        shares.append([share for _, share, *_ in modes.displaced()][1])
+    assert 0.0 < shares[0] < shares[1] <= shares[2] <= 1.0
+
+
 def test_the_way_a_robot_drives_tells_that_its_camera_was_turned():
     """It drives straight on for 10 m, and the turned camera has it going aslant by 0.06 rad."""
     modes, H, cov, pose = MountModes(3), np.eye(3) / 0.002, COV.copy(), np.zeros(3)
