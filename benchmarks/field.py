@@ -344,49 +344,65 @@ def _say(recording: Recording, o: Outcome) -> None:
 
 _HEAD = """# Recordings by others
 
-`python -m benchmarks.field --page docs/field.md`, of {day}: each recording as a stranger would run it. `fgloc init BAG`, then `info`, `smooth` and
-`online` with the `robot.yaml` that `init` wrote and the set's own map; no constant was fitted for a set and no sign put right. Sets that are text are only
-rewritten as bags (`benchmarks/field_recordings.py`). Beside fgloc, on the same messages: odometry alone, with its owner's nominal geometry, and a textbook's
-iSAM2 with fixed constants, which reads sightings as the headers have them (`benchmarks/field_peers.py`; its smoothed poses are shown). On a map it starts
-from the truth's first pose, which fgloc has to find; "alike" is the same textbook from the run's own first pose.
+`python -m benchmarks.field --page docs/field.md` of {day}: `fgloc init BAG`, then `info`, `smooth` and `online` with the `robot.yaml` that `init` wrote and the
+set's map; nothing was fitted for a set. On the same messages: odometry alone, with its owner's geometry and aligned to the truth, and an iSAM2 with fixed constants
+("textbook", smoothed poses), which on a map begins at the truth's first pose ("alike": at fgloc's). The best tuned iSAM2 is in the [public bench](public.md).
 
-ATE is the rmse of positions [m] against a truth without frozen poses and glitches. Where the truth's frame is not the map's a rigid motion is fitted for
-each estimator alike, and likewise the place of the tracked body on the robot where it is not stated. Odometry is always aligned. NEES/3 is the run's own
-(1 is expected). The exit code is that of `smooth` / `online`: 0, 3 (not to be trusted), 1 (no result, with a sentence), 124 (stopped after ten minutes).
+ATE is the rmse of positions [m]; where the truth's frame or the tracked body's place is not known, both are fitted for each estimator. NEES/3: batch / online, 1 is expected.
+Exit code: `smooth` / `online`. Choices were made with recordings marked *dev*; the others are only reported. Losses of batch against the best other first.
 
-Choices were made with the recordings marked *dev* (and with robots 1 and 2 of MRCLAM 6); the others are only reported. Not here: the Husky's windows of 2 s
-(no recording lasts) and TagSLAM's sets (no wheels).
-
-| recording | what is peculiar | odometry | textbook | alike | batch | online | NEES/3 | exit | named first |
-|---|---|---|---|---|---|---|---|---|---|
+| recording | odometry | textbook | alike | batch | online | NEES/3 | exit |
+|---|---|---|---|---|---|---|---|
 """
 
 
 def write_page(path: Path, chosen: Sequence[Recording], outcomes: Mapping[str, Outcome]) -> None:
-    """Write the table of all recordings, and of the answer sheet, as Markdown."""
+    """Write as Markdown: errors, losses first; what is peculiar, and which of it no finding says; why runs failed."""
     lines = [_HEAD.format(day=datetime.now(UTC).date().isoformat()).rstrip("\n")]
-    lines += [_line(recording, outcomes[recording.name]) for recording in chosen]
-    lines += ["", "## What a recording tells by itself", ""]
+    judged = [r for r in chosen if outcomes[r.name].ate]
+    lines += [_line(r, outcomes[r.name]) for r in sorted(judged, key=lambda r: _order(outcomes[r.name]))]
+    rest = ", ".join(f"{r.name} ({_codes(outcomes[r.name])})" for r in chosen if r not in judged)
     lines += [
-        "What is peculiar, as it was measured by hand, and whether `init`, `info` or a run's findings say it, with its figure.",
+        "",
+        f"Without truth or poses (exit codes): {rest or 'none'}.",
+        "",
+        "## What a recording tells by itself",
         "",
     ]
-    lines += ["| recording | to be told | told |", "|---|---|---|"]
-    for trap in SHEET:
-        if trap.recording in outcomes:
-            lines.append(
-                f"| {trap.recording} | {trap.what} | {'yes' if found(trap, outcomes[trap.recording]) else 'no'} |"
-            )
+    traps = [trap for trap in SHEET if trap.recording in outcomes]
+    missed = [f"{t.what} ({t.recording})" for t in traps if not found(t, outcomes[t.recording])]
+    lines += [
+        f"Of {len(traps)} peculiarities, measured by hand (`benchmarks/field_sheet.py`), `init`, `info` or a finding of a run says "
+        f"{len(traps) - len(missed)} with their figure. Not: {', '.join(missed) or 'none'}.",
+        "",
+        "| recording | what is peculiar |",
+        "|---|---|",
+    ]
+    for peculiar in dict.fromkeys(r.peculiar for r in chosen):
+        lines.append(f"| {', '.join(r.name for r in chosen if r.peculiar == peculiar)} | {peculiar} |")
+    lines += ["", "First finding of a run that ended with exit code 3, or its error:", ""]
+    lines += ["| recording | named first |", "|---|---|"]
+    lines += [
+        f"| {r.name} | {_first(outcomes[r.name], 'batch')} |" for r in chosen if outcomes[r.name].codes.get("batch")
+    ]
     with atomic_file(path) as file:
         file.write("\n".join(lines) + "\n")
 
 
+def _order(o: Outcome) -> float:
+    """Error of the best other over that of the batch; infinite without one."""
+    return o.best("batch") / o.ate["batch"] if "batch" in o.ate else math.inf
+
+
 def _line(recording: Recording, o: Outcome) -> str:
     nees = " / ".join(_figure(nees_of(o, mode), 2) for mode in MODES)
-    codes = " / ".join(str(o.codes.get(mode, "–")) for mode in MODES)
     ates = [_figure(o.ate.get(key), 3) for key in ("odometry", "textbook.batch", "alike.batch", "batch", "online")]
     name = f"{recording.name} *dev*" if recording.development else recording.name
-    return f"| {name} | {recording.peculiar} | {' | '.join(ates)} | {nees} | {codes} | {_first(o, 'batch')} |"
+    return f"| {name} | {' | '.join(ates)} | {nees} | {_codes(o)} |"
+
+
+def _codes(o: Outcome) -> str:
+    return " / ".join(str(o.codes.get(mode, "–")) for mode in MODES)
 
 
 def _figure(value: float | None, digits: int) -> str:
