@@ -167,33 +167,38 @@ _HEAD = """# Public bench
 <!-- Written by `python -m benchmarks.public --page docs/public.md` on {day}. -->
 
 Recordings that others made, with truth and landmarks: ATE [m] of fgloc with defaults after `fgloc init`, and of other programs on the same messages, losses first.
-Programs, their constants and the error are described in `benchmarks/public.py`. Baselines start at the truth's first pose on a map; fgloc has to find its own. Constants of
+Programs, their constants and the error are described in `benchmarks/public.py`. On a map the others start at the truth's first pose; fgloc has to find its own. Constants of
 `isam2` are the best on the recordings marked *dev*. Another program takes part by its poses (`--export`, `--poses`).
 
-| recording | mode | {programs} | best other / fgloc |
-|---|---|{dashes}---|
+| recording | {programs} | best other / fgloc: batch | online |
+|---|{dashes}---|---|
 """
 
 
 def write_page(path: Path, chosen: Sequence[Recording], found: Mapping[str, Mapping[str, float]]) -> None:
-    """Write the table as Markdown, the least ratio first."""
+    """Write the table as Markdown, the least ratio first. A program whose modes are alike has one column."""
     programs = list(dict.fromkeys(name.rsplit(".", 1)[0] for ate in found.values() for name in ate))
     programs.sort(key=lambda name: name != "fgloc")
+    columns = [(name, mode) for name in programs for mode in MODES]
+    for name in programs:
+        if all(ate.get(f"{name}.{MODES[0]}") == ate.get(f"{name}.{MODES[1]}") for ate in found.values()):
+            columns.remove((name, MODES[1]))
     rows = []
     for recording in chosen:
         ate = found[recording.name]
+        ratios = []
         for mode in MODES:
             best, own = best_of(ate, mode), ate.get(f"fgloc.{mode}", math.nan)
-            ratio = math.nan if best is None else ate[best] / own
-            cells = " | ".join(f"{ate[key]:.3f}" if (key := f"{name}.{mode}") in ate else "–" for name in programs)
-            name = f"{recording.name} *dev*" if recording.development else recording.name
-            rows.append(
-                (ratio, f"| {name} | {mode} | {cells} | {'no poses' if math.isnan(ratio) else f'{ratio:.2f}'} |")
-            )
-    rows.sort(key=lambda row: (not math.isnan(row[0]), row[0]))
-    head = _HEAD.format(
-        day=datetime.now(UTC).date().isoformat(), programs=" | ".join(programs), dashes="---|" * len(programs)
-    )
+            ratios.append(math.nan if best is None else ate[best] / own)
+        cells = [f"{ate[key]:.3f}" if (key := f"{name}.{mode}") in ate else "–" for name, mode in columns]
+        cells += ["no poses" if math.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios]
+        name = f"{recording.name} *dev*" if recording.development else recording.name
+        least = -math.inf if any(map(math.isnan, ratios)) else min(ratios)
+        rows.append((least, f"| {name} | {' | '.join(cells)} |"))
+    rows.sort(key=lambda row: row[0])
+    heads = [f"{name} {mode}" if (name, MODES[1]) in columns else name for name, mode in columns]
+    day = datetime.now(UTC).date().isoformat()
+    head = _HEAD.format(day=day, programs=" | ".join(heads), dashes="---|" * len(columns))
     with atomic_file(path) as file:
         file.write(head + "\n".join(line for _, line in rows) + "\n")
 
