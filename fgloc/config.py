@@ -60,28 +60,26 @@ class WheelsConfig(Section):
 
     source: Literal["auto", "twist", "pose", "ticks", "command", "none"] = Field(
         "auto",
-        description="twist or pose of the odometry; ticks of the joints; commands; auto: ticks if the geometry is "
-        "given, else pose if it moves along its heading, else twist, else command",
+        description="auto: ticks of the joints if the geometry is given, else pose of the odometry if it moves along "
+        "its heading, else its twist, else command",
     )
-    left_joint: str | None = Field(None, description="joint of the wheel on this side")
-    right_joint: str | None = Field(None, description="joint of the wheel on this side")
+    left_joint: str | None = Field(None, description="joint of the wheel")
+    right_joint: str | None = Field(None, description="joint of the wheel")
     left_radius: float | None = Field(
         None, ge=1e-6, le=2.0, description="m: way per unit of the angle, usually a radian"
     )
     right_radius: float | None = Field(
         None, ge=1e-6, le=2.0, description="m: way per unit of the angle, usually a radian"
     )
-    track: float | None = Field(None, ge=1e-3, le=5.0, description="m, between the contact points")
-    angle_range: float | None = expert(
-        None, ge=1e-3, le=1e9, description="rad after which the angle rolls over; None: never"
-    )
+    track: float | None = Field(None, ge=1e-3, le=5.0, description="between the contact points")
+    angle_range: float | None = expert(None, ge=1e-3, le=1e9, description="where the angle rolls over; None: never")
     drive: AnyDrive | None = Field(None, description="another drive than two wheels (docs/drives.md)")
     scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
     scale_omega: float = Field(1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: clockwise")
-    yaw_per_m: float = expert(0.0, ge=-1, le=1, description="rad/m: yaw gained on the straight, by unequal wheels")
-    slowdown: float = expert(0.0, ge=0, le=5.0, description="s/rad: share of the speed lost per rad/s of turning")
-    delay_s: float = expert(0.0, ge=0, le=2.0, description="s: the robot moves so long after the message")
-    hold_s: float = expert(0.5, gt=0, le=60, description="s: a twist is held so long without a next one")
+    yaw_per_m: float = expert(0.0, ge=-1, le=1, description="yaw gained on the straight, by unequal wheels")
+    slowdown: float = expert(0.0, ge=0, le=5.0, description="share of the speed lost per rad/s of turning")
+    delay_s: float = expert(0.0, ge=0, le=2.0, description="the robot moves so long after the message")
+    hold_s: float = expert(0.5, gt=0, le=60, description="a twist is held so long without a next one")
     zero_speed: float = expert(0.0, ge=0, le=10, description="m/s: a lower speed is rest")
     zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="rad/s: a lower rate is rest")
     noise: NoiseDensity = NoiseDensity()
@@ -92,15 +90,15 @@ class WheelsConfig(Section):
         description="sigma of a scale that both radii share",
     )
     turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="sigma of the track")
-    time_offset_sigma_s: float = expert(0.005, ge=0, le=1.0, description="s: sigma of their clock against the gyro's")
+    time_offset_sigma_s: float = expert(0.005, ge=0, le=1.0, description="sigma of their clock")
     yaw_per_m_sigma: float = expert(
         0.015,
         ge=0,
         le=1,
-        description="rad/m: sigma of yaw_per_m",
+        description="sigma of yaw_per_m",
     )
-    slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="s/rad: sigma of slowdown")
-    delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="s: sigma of delay_s")
+    slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="sigma of slowdown")
+    delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="sigma of delay_s")
 
     @property
     def in_radians(self) -> bool:
@@ -121,14 +119,14 @@ class GyroConfig(Section):
         "mounting to half a degree",
         ge=0,
         le=0.5,
-        description="rad: roll and pitch that the mounting is off by; estimated on uneven ground",
+        description="roll and pitch that the mounting is off by; estimated on uneven ground",
     )
     level_sigma_rad: float = constant(
         0.005,
         "a bias of 0.05 m/s², over gravity",
         ge=0,
         le=0.5,
-        description="rad: tilt that the accelerometer's bias makes, in roll and pitch; estimated on uneven ground",
+        description="tilt that the accelerometer's bias makes, in roll and pitch; estimated on uneven ground",
     )
     acceleration_sigma: float = constant(
         0.15,
@@ -149,27 +147,27 @@ class CameraConfig(Section):
     file: Path | None = Field(None, description="calibration, ROS or Kalibr YAML; None: CameraInfo")
     rescale: bool = expert(False, description="scale the calibration to the image size")
     focal_scale: float = expert(1.0, ge=0.01, le=100, description="true focal length over the calibration's")
-    cx_px: float | None = expert(None, ge=-1e5, le=1e5, description="px: principal point; None: the calibration's")
-    cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="px: principal point; None: the calibration's")
+    cx_px: float | None = expert(None, ge=-1e5, le=1e5, description="principal point; None: the calibration's")
+    cy_px: float | None = expert(None, ge=-1e5, le=1e5, description="principal point; None: the calibration's")
     k1: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; None: the calibration's")
     k2: float | None = expert(None, ge=-100, le=100, description="of plumb_bob; None: the calibration's")
-    position_sigma_m: float = expert(0.003, ge=0, le=1.0, description="m: sigma of the mounting, on each axis")
-    rotation_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="rad: likewise, about each axis")
+    position_sigma_m: float = expert(0.003, ge=0, le=1.0, description="sigma of the mounting, on each axis")
+    rotation_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="likewise, about each axis")
     focal_sigma: float = expert(0.003, ge=0, le=0.5, description="sigma of the focal length, as a share")
-    principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="px: sigma of the principal point")
+    principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="sigma of the principal point")
     distortion_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of k1 and k2")
     time_offset_sigma_s: float = expert(
         0.012,
         ge=0,
         le=1.0,
-        description="s: sigma of its clock against the gyro's (else the wheels')",
+        description="sigma of its clock",
     )
     time_jitter_s: float = constant(
         0.002,
         "jitter of a driver that stamps on arrival",
         ge=0,
         le=0.1,
-        description="s: what each stamp is off by on its own",
+        description="what each stamp is off by on its own",
     )
 
 
@@ -178,9 +176,9 @@ class NamedCameraConfig(CameraConfig):
 
     image: str | None = Field(None, description="topic of its images")
     camera_info: str | None = Field(None, description="topic of its calibration; None: beside its images")
-    sightings: str | None = Field(None, description="topic of markers that another node found in them")
+    sightings: str | None = Field(None, description="topic of markers found in them")
     pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
-        None, description="in the base frame, x forward: x y z [m] roll pitch yaw [rad]; None: tf"
+        None, description="as recording.sightings_pose"
     )
     axes: Literal["body", "optical"] | None = Field(None, description="as recording.sightings_axes; None: optical")
 
@@ -203,15 +201,13 @@ class LandmarksConfig(Section):
     bearing_bias_rad: float = expert(0.0, ge=-6.3, le=6.3, description="subtracted from the reported bearing")
     range_scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of range_scale")
     bearing_bias_sigma_rad: float = expert(0.007, ge=0, le=0.5, description="sigma of bearing_bias_rad")
-    position_sigma_m: float = expert(0.0, ge=0, le=1.0, description="m: sigma of the mounting, ahead and to the left")
-    time_offset_sigma_s: float = expert(
-        0.012, ge=0, le=1.0, description="s: sigma of the sensor's clock against gyro or wheels"
-    )
+    position_sigma_m: float = expert(0.0, ge=0, le=1.0, description="sigma of the mounting, ahead and to the left")
+    time_offset_sigma_s: float = expert(0.012, ge=0, le=1.0, description="sigma of the sensor's clock")
     yaw_sigma_rad: float | None = expert(
         None,
         ge=1e-5,
         le=3.2,
-        description="noise of a marker pose's yaw; None: only range and bearing are used",
+        description="noise of a marker pose's yaw; None: yaw is not used",
     )
     cauchy_k: float = expert(
         3.0, ge=0.01, le=1e6, description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose"
@@ -227,7 +223,7 @@ class LandmarksConfig(Section):
         0.0,
         ge=0,
         le=1e6,
-        description="s that errors of one landmark last; sooner repetitions count for less; not of corners",
+        description="errors of one landmark last so long; not of corners",
     )
 
 
@@ -241,14 +237,14 @@ class MarkersConfig(Section):
         2e-4,
         ge=0,
         le=0.1,
-        description="s: a corner is off by the image's motion in this time",
+        description="a corner is off by the image's motion in this time",
     )
     sway_rad: float = constant(
         0.005,
         "between 0.0005 and 0.015 nothing changes",
         ge=0,
         le=0.5,
-        description="rad: sigma of a base's roll and pitch in each image, on a flat floor",
+        description="sigma of a base's roll and pitch in each image, on a flat floor",
     )
     cauchy_k: float = constant(
         3.0,
@@ -459,17 +455,17 @@ class RecordingConfig(Section):
         description="beside the wheels: name, topic, pose of each (docs/odometries.md)",
     )
     received_stamps: tuple[_KnownRole, ...] = Field(
-        (), description="roles whose header stamps are replaced by receive times"
+        (), description="roles with receive times in place of header stamps"
     )
     clock_sigma_s: float = constant(
         0.003,
         "the other clocks are measured against it",
         ge=0,
         le=1.0,
-        description="s: how far the clock may be off to which the others are compared: the gyro's, or the wheels'",
+        description="how far the clock may be off to which the others are compared: the gyro's, or the wheels'",
     )
     stamp_offset_s: dict[_KnownRole, Annotated[float, Field(ge=-4e9, le=4e9)]] = Field(
-        {}, description="added to a role's stamps [s]"
+        {}, description="added to a role's stamps"
     )
     base_frame: str | None = Field(None, description="None: base_link, base_footprint or base")
     sightings_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
@@ -477,7 +473,7 @@ class RecordingConfig(Section):
     )
     sightings_axes: Literal["body", "optical"] | None = Field(
         None,
-        description="of what it measures: body (x forward) or optical (z forward; None: of cameras)",
+        description="of what it measures: body (x forward), optical (z forward); None: optical of cameras",
     )
     imu_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
         None, description="IMU, likewise; None: tf"
@@ -547,9 +543,9 @@ class GateConfig(Section):
 class KeyframesConfig(Section):
     """When a pose is added to the graph."""
 
-    max_interval_s: float = expert(0.2, ge=0.001, le=60, description="s between two poses, at most")
+    max_interval_s: float = expert(0.2, ge=0.001, le=60, description="between two poses, at most")
     min_interval_s: float = constant(0.05, "bounds the poses per second", ge=0, le=60)
-    reorder_s: float = expert(0.1, ge=0, le=60, description="s that messages wait to be put in order")
+    reorder_s: float = expert(0.1, ge=0, le=60, description="messages wait so long to be put in order")
     history_s: float = constant(
         2.0,
         "the shipped models read 0.8 s",
@@ -570,8 +566,8 @@ class MapConfig(Section):
 
     scale: float = Field(1.0, ge=1e-4, le=1e4, description="metres per unit of positions")
     size_scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres per unit of the map's marker sizes")
-    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="m: sigma of a landmark, on each axis")
-    rotation_sigma_rad: float = expert(0.0087, ge=0, le=1.0, description="rad: sigma of a marker, about each axis")
+    position_sigma_m: float = Field(0.005, ge=0, le=10.0, description="sigma of a landmark, on each axis")
+    rotation_sigma_rad: float = expert(0.0087, ge=0, le=1.0, description="sigma of a marker, about each axis")
 
 
 class EstimatorConfig(Section):
@@ -581,11 +577,11 @@ class EstimatorConfig(Section):
         "fixed_lag", description="isam2: the whole run; ekf: for comparison"
     )
     ground: Literal["flat", "uneven"] = Field("flat", description="uneven: also height, roll and pitch")
-    lag_s: float = expert(10.0, ge=0.05, le=1e5, description="s that the fixed lag keeps open")
+    lag_s: float = expert(10.0, ge=0.05, le=1e5, description="window of the fixed lag")
     relinearize_threshold: float = constant(0.01, "1 cm or 0.6 degrees", ge=1e-6, le=10)
     initial_pose: tuple[_Far, _Far, _Far] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
     initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = expert((0.05, 0.05, 0.05), description="m, m, rad: of initial_pose")
-    initialise_s: float = expert(5.0, ge=0.01, le=1e5, description="s that sightings are collected for the first pose")
+    initialise_s: float = expert(5.0, ge=0.01, le=1e5, description="time to collect sightings for the first pose")
     gate_probability: float = constant(
         GATE,
         "one sound sighting in 10 000",
@@ -593,7 +589,7 @@ class EstimatorConfig(Section):
         lt=1,
         description="a sighting less likely than 1 - this is not fused",
     )
-    dead_reckoning_after_s: float = expert(2.0, gt=0, le=1e6, description="s without a fix until DEAD_RECKONING")
+    dead_reckoning_after_s: float = expert(2.0, gt=0, le=1e6, description="without a fix, until DEAD_RECKONING")
     motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = expert(
         "none", description="robust kernel on the wheels, online; for comparison"
     )
@@ -617,9 +613,7 @@ class WeightsConfig(Section):
     """Weights of motion and landmark factors."""
 
     adaptive: bool = expert(True, description="false: no test of sources; sightings are still gated")
-    distrust: tuple[Distrust, ...] = expert(
-        (), description="known failures: `source`, `start_s`, `end_s`; it is left out"
-    )
+    distrust: tuple[Distrust, ...] = expert((), description="known failures to leave out: `source`, `start_s`, `end_s`")
     window_s: float = constant(
         2.0,
         "part of the fault test",
@@ -647,7 +641,7 @@ class LiveConfig(Section):
     """A live run."""
 
     startup_s: float = expert(
-        2.0, ge=0, le=1e6, description="s after the first event, when the run begins with what has come"
+        2.0, ge=0, le=1e6, description="so long after the first event the run begins with what has come"
     )
     image_queue: int = constant(
         4, "older images are late", gt=0, le=100_000, description="images that may wait for detection; the oldest goes"
@@ -660,8 +654,8 @@ class IntegrityConfig(Section):
     risk_per_hour: float = expert(
         1e-3, ge=1e-9, le=0.5, description="that the error exceeds the bound, in an hour of driving"
     )
-    alert_m: float | None = Field(None, gt=0, le=1e6, description="larger bounds on the position raise an alert")
-    alert_yaw_rad: float | None = Field(None, gt=0, le=3.2, description="rad: likewise, on the yaw")
+    alert_m: float | None = Field(None, gt=0, le=1e6, description="alert where the bound on the position is larger")
+    alert_yaw_rad: float | None = Field(None, gt=0, le=3.2, description="likewise, on the yaw")
 
 
 class TruthConfig(Section):
@@ -672,7 +666,7 @@ class TruthConfig(Section):
     axes: Literal["enu", "ned"] = expert("enu", description="ned: x north, y east, yaw clockwise")
     scale: float = expert(1.0, ge=1e-4, le=1e4, description="metres per unit of positions")
     align: Literal["none", "se2"] = Field("none", description="se2: the truth's frame is not the map's")
-    max_gap_s: float = expert(0.2, gt=0, le=1e6, description="s: longer gaps are not interpolated")
+    max_gap_s: float = expert(0.2, gt=0, le=1e6, description="longer gaps are not interpolated")
 
 
 class Config(SensorSections):

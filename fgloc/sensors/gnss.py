@@ -51,7 +51,7 @@ class GnssConfig(Section):
         ]
         | None
     ) = Field(None, description="of the map: latitude, longitude [°], ellipsoidal altitude [m]")
-    yaw_rad: float = Field(0.0, ge=-7, le=7, description="rad: map's x axis from east, counter-clockwise")
+    yaw_rad: float = Field(0.0, ge=-7, le=7, description="map's x axis from east, counter-clockwise")
     antenna: tuple[_Metres, _Metres] | None = Field(
         None, description="x y [m] in the base frame; None: tf, else the base"
     )

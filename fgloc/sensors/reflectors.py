@@ -41,17 +41,15 @@ class ReflectorsConfig(Section):
     """Reflectors seen by a laser scanner."""
 
     min_intensity: float | None = Field(
-        None, gt=0, le=1e9, description="intensity from which on a beam met a reflector; None: none is used"
+        None, gt=0, le=1e9, description="of a beam that met a reflector; None: none is used"
     )
     size_m: float = Field(
         0.3,
         ge=0.01,
         le=5,
-        description="m: bright beams this near to each other are one reflector; a wider spot is none",
+        description="bright beams so near are one reflector; a wider spot is none",
     )
-    radius_m: float = Field(
-        0.0, ge=0, le=2, description="m, of round reflectors: added to ranges, as the map has their centres"
-    )
+    radius_m: float = Field(0.0, ge=0, le=2, description="of round reflectors: added to ranges")
     pose: tuple[_Metres, _Metres, Annotated[float, Field(ge=-7, le=7)]] | None = Field(
         None, description="x y [m], yaw [rad] of the scanner in the base frame; None: tf, else the base"
     )

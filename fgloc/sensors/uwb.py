@@ -58,13 +58,13 @@ class UwbConfig(Section):
     tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
     sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
     scale: float = Field(1.0, ge=0.1, le=10, description="reported over true range, bias_m subtracted")
-    bias_m: float = Field(0.0, ge=-10, le=10, description="m: subtracted from every range")
+    bias_m: float = Field(0.0, ge=-10, le=10, description="subtracted from every range")
     bias_sigma_m: float = Field(0.1, ge=0, le=10, description="sigma of bias_m")
     scale_sigma: float = Field(0.05, ge=0, le=0.5, description="sigma of scale")
     non_line_of_sight: Literal["mixture", "reject"] = Field(
         "mixture", description="mixture: use too long ranges with nlos_*; reject: drop them"
     )
-    nlos_bias_m: float = Field(1.0, ge=0, le=100, description="m by which such a range is too long ...")
+    nlos_bias_m: float = Field(1.0, ge=0, le=100, description="such a range is too long by ...")
     nlos_sigma_m: float = Field(3.0, ge=0.01, le=100, description="... and its sigma")
 
 

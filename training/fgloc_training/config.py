@@ -15,19 +15,17 @@ class DataConfig(Section):
     """How recordings become samples at a fixed time step."""
 
     smoothing_s: float = Field(0.5, gt=0, description="window of the local cubic fit that smooths the truth")
-    max_truth_gap_s: float = Field(0.15, gt=0, description="s: no samples across longer gaps of the truth")
+    max_truth_gap_s: float = Field(0.15, gt=0, description="no samples across longer gaps of the truth")
     max_sideways_mps: float | None = Field(
         None,
         gt=0,
-        description="m/s: no samples where the truth slides faster sideways; null: the robot may slide",
+        description="no samples where the truth slides faster sideways",
     )
-    max_truth_sigma_m: float | None = Field(
-        0.05, gt=0, description="m: largest sigma of a smoothed position that counts as truth"
-    )
-    margin_s: float = Field(0.5, ge=0, description="s left out at both ends")
-    history_s: float = Field(3.0, ge=0, description="s of commands before the first sample")
-    apart_s: float = Field(10.0, gt=0, description="s: a longer gap begins another run")
-    shortest_s: float = Field(10.0, gt=0, description="s: a shorter recording is refused")
+    max_truth_sigma_m: float | None = Field(0.05, gt=0, description="largest sigma of a smoothed truth")
+    margin_s: float = Field(0.5, ge=0, description="left out at both ends")
+    history_s: float = Field(3.0, ge=0, description="commands before the first sample")
+    apart_s: float = Field(10.0, gt=0, description="a longer gap begins another run")
+    shortest_s: float = Field(10.0, gt=0, description="a shorter recording is refused")
 
 
 class NetworkConfig(Section):
@@ -38,22 +36,18 @@ class NetworkConfig(Section):
         (128, 128), description="units of the layers; gru: of the cell first; naive, lag, arx: unused"
     )
     variance_units: int = Field(64, gt=0, description="displacement: width of the layers of the variance")
-    members: int = Field(1, ge=1, le=64, description="displacement: networks of different seeds, averaged")
-    dt_s: float = Field(0.1, gt=0, le=1.0, description="s: step of the samples, longest sub-step of a run")
+    members: int = Field(1, ge=1, le=64, description="displacement: networks that are averaged")
+    dt_s: float = Field(0.1, gt=0, le=1.0, description="step of the samples, longest sub-step of a run")
     edges_s: tuple[float, ...] = Field(
         (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
-        description="s: ages between which commands are averaged",
+        description="ages between which commands are averaged",
     )
     inputs: tuple[Input, ...] = Field(("commands",), description="displacement: what the network reads")
-    signal_edges_s: tuple[float, ...] = Field(
-        (0.0,), description="s: ages between which measured signals are averaged, from 0"
-    )
+    signal_edges_s: tuple[float, ...] = Field((0.0,), description="the same of measured signals, from 0")
     gyro_bias_sigma: float = Field(0.0, ge=0, description="rad/s: error of the known bias, drawn in training")
-    velocity_sigma: tuple[float, float] = Field(
-        (0.02, 0.05), description="noise of the velocity among the inputs [m/s, rad/s]"
-    )
-    velocity_decay_s: float = Field(0.3, gt=0, description="s after which a measured velocity says little")
-    hold_s: float = Field(1.5, gt=0, description="s that a command holds without a next one")
+    velocity_sigma: tuple[float, float] = Field((0.02, 0.05), description="noise of the velocity among the inputs")
+    velocity_decay_s: float = Field(0.3, gt=0, description="after it a measured velocity says little")
+    hold_s: float = Field(1.5, gt=0, description="a command holds so long without a next one")
 
     @model_validator(mode="after")
     def _may_be_an_ensemble(self) -> NetworkConfig:
@@ -68,20 +62,20 @@ class OptimizationConfig(Section):
     """Multi-step loss, Adam, early stopping."""
 
     seed: int = Field(0, description="of first weights, batches, noise")
-    horizon_s: float = Field(2.0, gt=0, description="s: rollouts in the loss")
+    horizon_s: float = Field(2.0, gt=0, description="rollouts in the loss")
     batch: int = Field(128, gt=0, description="rollouts a step")
     iterations: int = Field(1000, gt=0, description="steps, at most")
     validate_every: int = Field(100, gt=0, description="iterations between two validations")
-    validation_s: tuple[float, ...] = Field((10.0, 30.0), description="s: windows whose mean drift is validated")
-    patience: int = Field(6, gt=0, description="validations without improvement until it stops")
+    validation_s: tuple[float, ...] = Field((10.0, 30.0), description="windows whose mean drift is validated")
+    patience: int = Field(6, gt=0, description="validations without improvement")
     learning_rate: float = Field(3e-3, gt=0, description="of Adam")
-    position_sigma_m: float = Field(0.02, gt=0, description="position errors weigh in this unit")
-    yaw_sigma_rad: float = Field(0.05, gt=0, description="yaw errors weigh in this unit")
-    variance_horizon_s: float = Field(1.0, gt=0, description="s: rollouts whose likelihood sets the variance")
+    position_sigma_m: float = Field(0.02, gt=0, description="unit of position errors")
+    yaw_sigma_rad: float = Field(0.05, gt=0, description="unit of yaw errors")
+    variance_horizon_s: float = Field(1.0, gt=0, description="rollouts whose likelihood sets the variance")
     variance_piece_s: float = Field(
         0.2,
         gt=0,
-        description="s: pieces of them that count as much",
+        description="pieces of them that count as much",
     )
     nll_beta: float = Field(
         0.0, ge=0, le=1, description="β of the β-NLL; 0: likelihood; 1: equal weight of all windows"
@@ -94,25 +88,25 @@ class CalibrationConfig(Section):
 
     cross: bool = Field(
         False,
-        description="also calibrate on each training recording, by a model that left it out",
+        description="also on each training recording, by a model that left it out",
     )
-    horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="s: windows whose likelihood is maximized")
-    short_s: tuple[float, ...] = Field((0.2, 1.0), description="s: windows that separate lasting from passing errors")
-    memory_s: tuple[float, ...] = Field((0.2, 0.5, 1.0, 2.0), description="s: time constants tried for lasting errors")
-    window_s: float = Field(5.0, gt=0, description="s: windows of W, N and C")
+    horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="windows whose likelihood is maximized")
+    short_s: tuple[float, ...] = Field((0.2, 1.0), description="windows that separate lasting from passing errors")
+    memory_s: tuple[float, ...] = Field((0.2, 0.5, 1.0, 2.0), description="time constants tried for lasting errors")
+    window_s: float = Field(5.0, gt=0, description="windows of W, N and C")
 
 
 class AdaptationConfig(Section):
     """How far a model moves towards another robot of its kind."""
 
-    scale_sigma: float = Field(0.02, gt=0, description="relative spread of the gains of robots of a kind")
-    yaw_per_m_sigma: float = Field(0.02, gt=0, description="rad/m: spread of their pull to one side")
-    window_s: float = Field(10.0, gt=0, description="s: windows whose errors are compared")
+    scale_sigma: float = Field(0.02, gt=0, description="spread of the gains of robots of a kind")
+    yaw_per_m_sigma: float = Field(0.02, gt=0, description="spread of their pull to one side")
+    window_s: float = Field(10.0, gt=0, description="windows whose errors are compared")
 
     after_training_s: float | None = Field(
         None,
         gt=0,
-        description="s: then fit gains and pull to windows of this length; for a smoothed truth",
+        description="after training, fit gains and pull to such windows; for a smoothed truth",
     )
 
     @property
@@ -122,7 +116,7 @@ class AdaptationConfig(Section):
 
 
 class SpeedLimits(Section):
-    """Largest commands of the robot: training names what the recordings left out."""
+    """Largest commands of the robot."""
 
     v_mps: float = Field(gt=0, description="forward")
     omega_radps: float = Field(gt=0, description="to either side")
@@ -132,11 +126,11 @@ class SpeedLimits(Section):
 class TrainConfig(Section):
     """One training run, or one per recording left out."""
 
-    robot: str = Field(description="name of the robot, for the model's card")
-    recordings: dict[str, Path] = Field(description="bags by name, relative to --data")
+    robot: str = Field(description="name, for the model's card")
+    recordings: dict[str, Path] = Field(description="bags by name")
     truth: dict[str, Path] = Field(
         {},
-        description="folders of `fgloc smooth` by name, relative to --data, in place of the bags' truth",
+        description="folders of `fgloc smooth` by name, in place of the bags' truth",
     )
     leave_one_out: bool = Field(False, description="a model per recording left out, and one from all")
     split: Split | None = None

@@ -109,11 +109,11 @@ class JointErrors(Section):
 
 
 class Split(Section):
-    """Recordings by name: what the weights, the early stopping with the calibration, and the figures have seen."""
+    """Recordings by name."""
 
     train: tuple[str, ...] = Field(description="the weights learn from these")
     validation: tuple[str, ...] = Field(description="these say when to stop, and how sure the model may be")
-    test: tuple[str, ...] = Field((), description="the model is judged by these, and learns nothing of them")
+    test: tuple[str, ...] = Field((), description="these judge the model")
 
 
 class ModelCard(Section):
