@@ -65,23 +65,19 @@ class WheelsConfig(Section):
     )
     left_joint: str | None = Field(None, description="joint of the wheel")
     right_joint: str | None = Field(None, description="joint of the wheel")
-    left_radius: float | None = Field(
-        None, ge=1e-6, le=2.0, description="m: way per unit of the angle, usually a radian"
-    )
-    right_radius: float | None = Field(
-        None, ge=1e-6, le=2.0, description="m: way per unit of the angle, usually a radian"
-    )
+    left_radius: float | None = Field(None, ge=1e-6, le=2.0, description="way per unit of the angle, usually rad")
+    right_radius: float | None = Field(None, ge=1e-6, le=2.0, description="way per unit of the angle, usually rad")
     track: float | None = Field(None, ge=1e-3, le=5.0, description="between the contact points")
-    angle_range: float | None = expert(None, ge=1e-3, le=1e9, description="where the angle rolls over; None: never")
-    drive: AnyDrive | None = Field(None, description="another drive than two wheels (docs/drives.md)")
+    angle_range: float | None = expert(None, ge=1e-3, le=1e9, description="where the angle rolls over")
+    drive: AnyDrive | None = Field(None, description="another drive (docs/drives.md)")
     scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
     scale_omega: float = Field(1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: clockwise")
     yaw_per_m: float = expert(0.0, ge=-1, le=1, description="yaw gained on the straight, by unequal wheels")
     slowdown: float = expert(0.0, ge=0, le=5.0, description="share of the speed lost per rad/s of turning")
     delay_s: float = expert(0.0, ge=0, le=2.0, description="the robot moves so long after the message")
     hold_s: float = expert(0.5, gt=0, le=60, description="a twist is held so long without a next one")
-    zero_speed: float = expert(0.0, ge=0, le=10, description="m/s: a lower speed is rest")
-    zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="rad/s: a lower rate is rest")
+    zero_speed: float = expert(0.0, ge=0, le=10, description="a lower speed is rest")
+    zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="a lower rate is rest")
     noise: NoiseDensity = NoiseDensity()
     scale_sigma: float = Field(
         0.01,
@@ -113,7 +109,7 @@ class GyroConfig(Section):
     scale: float = expert(1.0, ge=-1e3, le=1e3, description="true over reported rate; negative: clockwise")
     yaw_per_sqrt_s: float = expert(0.002, ge=1e-6, le=10, description="rad/√s: noise of the integrated rate")
     scale_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of scale")
-    bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="rad/s: sigma of the bias at the start")
+    bias_sigma: float = expert(0.02, ge=1e-6, le=10, description="sigma of the bias at the start")
     tilt_sigma_rad: float = constant(
         0.0087,
         "mounting to half a degree",
@@ -133,7 +129,7 @@ class GyroConfig(Section):
         "vibration of a driving robot",
         ge=1e-3,
         le=100,
-        description="m/s²: of the specific force of a step, beside gravity; on uneven ground",
+        description="of the specific force of a step, beside gravity; on uneven ground",
     )
     bias_walk: float = constant(0.0003, "of a MEMS gyro; rests measure the bias", ge=0, le=10, description="rad/s/√s")
 
@@ -496,13 +492,13 @@ class RecordingConfig(Section):
 class GateConfig(Section):
     """What is too wrong to enter the graph."""
 
-    max_speed: float = expert(5.0, gt=0, le=1e3, description="m/s, of the robot")
-    max_yaw_rate: float = expert(10.0, gt=0, le=1e4, description="rad/s, of the robot")
+    max_speed: float = expert(5.0, gt=0, le=1e3, description="of the robot")
+    max_yaw_rate: float = expert(10.0, gt=0, le=1e4, description="of the robot")
     max_wheel_rate: float = constant(500.0, "ticks taken for radians exceed it", gt=0, le=1e6, description="rad/s")
-    max_position: float = expert(1e6, gt=0, le=1e9, description="m, of an odometry or truth pose")
-    max_range: float = expert(50.0, gt=0, le=1e5, description="m, of a sighting")
+    max_position: float = expert(1e6, gt=0, le=1e9, description="of an odometry or truth pose")
+    max_range: float = expert(50.0, gt=0, le=1e5, description="of a sighting")
     min_range: float = constant(
-        0.0, "a range is positive", ge=0, le=1e5, description="m: sightings have to be farther off than this"
+        0.0, "a range is positive", ge=0, le=1e5, description="sightings have to be farther off than this"
     )
     max_variance: float = constant(
         1e6, "drivers write 1e6 or more for unknown", gt=0, le=1e12, description="above it a variance says 'unknown'"
@@ -580,7 +576,7 @@ class EstimatorConfig(Section):
     lag_s: float = expert(10.0, ge=0.05, le=1e5, description="window of the fixed lag")
     relinearize_threshold: float = constant(0.01, "1 cm or 0.6 degrees", ge=1e-6, le=10)
     initial_pose: tuple[_Far, _Far, _Far] | None = Field(None, description="x y [m] yaw [rad]; None: from sightings")
-    initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = expert((0.05, 0.05, 0.05), description="m, m, rad: of initial_pose")
+    initial_sigmas: tuple[_Sigma, _Sigma, _Sigma] = expert((0.05, 0.05, 0.05), description="of initial_pose")
     initialise_s: float = expert(5.0, ge=0.01, le=1e5, description="time to collect sightings for the first pose")
     gate_probability: float = constant(
         GATE,

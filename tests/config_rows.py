@@ -18,6 +18,7 @@ from fgloc_training.config import TrainConfig
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGES = {"configuration.md": robot_file(), "identification.md": TrainConfig}
 _OWN_TABLE = (CameraConfig,)
+_EXPERT = "expert."
 _OF_KINDS = "`kind` names the drive, the other keys describe it."
 
 
@@ -35,7 +36,7 @@ def sections(model=PAGES["configuration.md"], path=""):
             yield f"{path}{name}", kinds
 
 
-def rows(section):
+def rows(section, prefix=""):
     """One line of a Markdown table per value of a section, or of one of several kinds.
 
     Neighbouring keys with the same default and meaning share a line. Keys of a parent class that has a table of its own
@@ -52,7 +53,7 @@ def rows(section):
         if _section(field) is None and name not in elsewhere
     ]
     for (default, meaning), alike in itertools.groupby(told, key=lambda row: row[1]):
-        yield f"| {', '.join(f'`{name}`' for name, _ in alike)} | {default} | {meaning} |"
+        yield f"| {', '.join(f'`{prefix}{name}`' for name, _ in alike)} | {default} | {meaning} |"
 
 
 def _rows_of_kinds(kinds):
@@ -97,17 +98,20 @@ def _default(value):
 
 
 def tables(model=PAGES["configuration.md"]):
-    """All tables, as they stand in the document; first that of the values outside every section."""
-    parts, said = [], set()
+    """All tables, as they stand in the document; first that of the values outside every section.
+
+    Values of experts stand in the table of their section, if it has one, by their whole key.
+    """
+    parts = {}
     for name, section in (("top level", model), *sections(model)):
-        if lines := list(rows(section)):
+        if (users := name.removeprefix(_EXPERT)) != name and users in parts:
+            parts[users] += list(rows(section, f"{name}."))
+        elif lines := list(rows(section)):
             about, columns = _OF_KINDS, "| key | kinds | default | meaning |\n|---|---|---|---|"
             if not isinstance(section, tuple):
                 about, columns = section.__doc__.strip().splitlines()[0], "| key | default | meaning |\n|---|---|---|"
-            head = f"### {name}\n\n{columns}" if about in said else f"### {name}\n\n{about}\n\n{columns}"
-            said.add(about)  # the values of experts are of the same section
-            parts.append("\n".join([head, *lines]) + "\n")
-    return "\n".join(parts)
+            parts[name] = [f"### {name}\n\n{about}\n\n{columns}", *lines]
+    return "\n".join("\n".join(lines) + "\n" for lines in parts.values())
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ class Drive(Section):
     unequal: ClassVar[bool] = True  # whether unequal wheels turn it on the straight: `wheels.yaw_per_m`
 
     kind: str
-    radius: Metres = Field(description="m, of the driven wheels, over the gear ratio of ticks_per_turn")
+    radius: Metres = Field(description="of the driven wheels, over the gear ratio of ticks_per_turn")
     ticks_per_turn: float | None = Field(
         None, ge=1e-3, le=1e9, description="encoder ticks a turn of the driven joints; None: rad"
     )

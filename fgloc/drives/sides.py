@@ -18,8 +18,8 @@ class _Sides(Drive):
 
     left: tuple[str, ...] = Field(min_length=1, description="joints of the left side")
     right: tuple[str, ...] = Field(min_length=1, description="joints of the right side")
-    track: Metres = Field(description="m, between the sides")
-    axle_x: Place = Field(0.0, description="m: x of the point that does not move sideways")
+    track: Metres = Field(description="between the sides")
+    axle_x: Place = Field(0.0, description="x of the point that does not move sideways")
 
     @property
     def driven(self) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ class Mecanum(Drive):
     slides: ClassVar[bool] = True
     kind: Literal["mecanum"] = "mecanum"
     wheels: tuple[str, str, str, str] = Field(description="joints: front left, front right, rear left, rear right")
-    half_sum: Metres = Field(description="m: half the wheelbase and half the track, added")
+    half_sum: Metres = Field(description="half the wheelbase and half the track, added")
     lateral: float = Field(1.0, ge=0.1, le=10, description="true over ideal way sideways")
 
     @property
@@ -68,7 +68,7 @@ class Omni(Drive):
     angles_deg: tuple[float, ...] = Field(
         min_length=3, description="place of each on the ring, from straight ahead to the left"
     )
-    ring: Metres = Field(description="m: its radius")
+    ring: Metres = Field(description="its radius")
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -99,8 +99,8 @@ class Swerve(Steered):
     kind: Literal["swerve"] = "swerve"
     wheels: tuple[str, ...] = Field(min_length=2, description="joints of the wheels")
     steering_joints: tuple[str, ...] = Field(min_length=2, description="joints of the steering, in the same order")
-    places: tuple[tuple[Place, Place], ...] = Field(min_length=2, description="m: x y of the modules")
-    steering_zeros: tuple[float, ...] = Field((), description="rad: added to the angles")
+    places: tuple[tuple[Place, Place], ...] = Field(min_length=2, description="x y of the modules")
+    steering_zeros: tuple[float, ...] = Field((), description="added to the angles")
     size: float = Field(1.0, ge=0.1, le=10, description="true places over those given")
 
     @property

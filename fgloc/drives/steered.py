@@ -18,9 +18,9 @@ class _Axle(Steered):
     """Base of drives with a rear axle that does not steer."""
 
     unequal: ClassVar[bool] = False
-    wheelbase: Metres = Field(description="m, from rear to steered axle")
-    steering_zero: float = Field(0.0, ge=-2, le=2, description="rad: added to the angle")
-    axle_x: Place = Field(0.0, description="m: x of the rear axle in the base frame")
+    wheelbase: Metres = Field(description="from rear to steered axle")
+    steering_zero: float = Field(0.0, ge=-2, le=2, description="added to the angle")
+    axle_x: Place = Field(0.0, description="x of the rear axle in the base frame")
 
     def usual_sigmas(self) -> dict[str, float]:
         """Prior sigmas of radius, wheelbase, steering_ratio, steering_zero and axle_x."""
@@ -46,11 +46,11 @@ class Ackermann(_Axle):
 
     kind: Literal["ackermann"] = "ackermann"
     wheels: tuple[str, ...] = Field(("speed",), min_length=1, description="joints of the measured wheels")
-    wheel_y: tuple[Place, ...] = Field((), description="m: of each, left of the middle; none: 0")
+    wheel_y: tuple[Place, ...] = Field((), description="of each, left of the middle; none: 0")
     steering_joints: tuple[str, ...] = Field(
         ("steering_angle",), min_length=1, max_length=2, description="one joint, or left and right"
     )
-    radius: Metres = Field(1.0, description="m, of the wheels; 1: their rate is a speed in m/s")
+    radius: Metres = Field(1.0, description="of the wheels; 1: their rate is a speed in m/s")
 
     @property
     def driven(self) -> tuple[str, ...]:

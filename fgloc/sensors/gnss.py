@@ -55,7 +55,7 @@ class GnssConfig(Section):
     antenna: tuple[_Metres, _Metres] | None = Field(
         None, description="x y [m] in the base frame; None: tf, else the base"
     )
-    sigma_m: float = Field(1.5, ge=1e-3, le=1e3, description="m, where the message has no covariance")
+    sigma_m: float = Field(1.5, ge=1e-3, le=1e3, description="where the message has no covariance")
     sigma_scale: float = Field(1.0, ge=0.01, le=100, description="true sigma over the message's")
 
 

@@ -44,7 +44,7 @@ class NetworkConfig(Section):
     )
     inputs: tuple[Input, ...] = Field(("commands",), description="displacement: what the network reads")
     signal_edges_s: tuple[float, ...] = Field((0.0,), description="the same of measured signals, from 0")
-    gyro_bias_sigma: float = Field(0.0, ge=0, description="rad/s: error of the known bias, drawn in training")
+    gyro_bias_sigma: float = Field(0.0, ge=0, description="error of the known bias, drawn in training")
     velocity_sigma: tuple[float, float] = Field((0.02, 0.05), description="noise of the velocity among the inputs")
     velocity_decay_s: float = Field(0.3, gt=0, description="after it a measured velocity says little")
     hold_s: float = Field(1.5, gt=0, description="a command holds so long without a next one")
