@@ -18,7 +18,7 @@ from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.info import RecordingInfo, inspect_recording, placing_roles
+from fgloc.recording.info import LACKING, RecordingInfo, inspect_recording, placing_roles
 from fgloc.recording.reader import Recording, is_derived
 from fgloc.recording.storage import find_beside
 from fgloc.sensor_setup import recorded_setup
@@ -143,10 +143,9 @@ def first_settings(bag: Path, ask: Ask | None = None) -> RobotFile:
     elif compared is not None and seen.has_map:  # without a map these constants are not estimated
         text = _with_lines(text, {"wheels": _WHEELS})
     missing += [f.text for f in found if not f.lines]
-    lacking = ["nothing measures", "CameraInfo", "calibration is for", "frame", "tf"]
-    if not placing_roles(seen.info.roles, config_of_file(yaml.safe_load(text) or {})):
-        lacking.append("nothing bounds")
-    missing += [text for text in seen.info.findings if any(word in text for word in lacking)]
+    placed = placing_roles(seen.info.roles, config_of_file(yaml.safe_load(text) or {}))
+    lacking = {*LACKING} - ({"place.unbounded"} if placed else set())
+    missing += [f.text for f in seen.info.found if f.code in lacking]
     return RobotFile(text, dict(seen.info.roles), tuple(dict.fromkeys(missing)), found)
 
 

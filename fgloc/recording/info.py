@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -315,7 +315,8 @@ def inspect_recording(
     times, checks, child_frame = _read_through(recording, watch)
     start_ns = min((t.received[0] for t in times.values() if t.received), default=0)
     undecodable = dict(recording.undecodable)
-    reports, findings = [], []
+    reports: list[TopicReport] = []
+    findings: list[str] = []
     for info in recording.topics:
         report, found = report_topic(info, times[info.name], start_ns, config)
         reports.append(report)
@@ -325,8 +326,6 @@ def inspect_recording(
             with np.errstate(all="ignore"):  # absurd magnitudes overflow: that is what is looked for
                 findings += checks[info.name].findings(info.name, seconds, config)
     findings += [f"{topic}: {n} messages cannot be decoded." for topic, n in undecodable.items()]
-    findings += _roles(recording, config, checks, child_frame)
-    findings += early_clocks(reports)
     ids = next((c.ids for c in checks.values() if isinstance(c, SightingsChecks)), Counter())
     return RecordingInfo(
         path=recording.path,
@@ -340,6 +339,8 @@ def inspect_recording(
         problems=recording.problems,
         found=(
             *note("recording", findings, Severity.WARNING),
+            *_roles(recording, config, checks, child_frame),
+            *note("recording", early_clocks(reports), Severity.WARNING),
             *note("recording.unused", _unused(recording, config), Severity.NOTE),
         ),
         notes=recording.notes,
@@ -372,33 +373,39 @@ def _read_through(
     return times, checks, child_frame
 
 
-def _roles(recording: Recording, config: Config, checks: Mapping[str, Collector], child_frame: str) -> list[str]:
-    """Roles that a run needs and the recording lacks, one sentence each."""
-    roles, found = recording.roles, []
+LACKING = ("motion.unmeasured", "place.unbounded", "camera.uncalibrated", "camera.resolution", "frame.unmounted")
+"""Codes of what a run needs and the recording lacks."""
+
+
+def _roles(
+    recording: Recording, config: Config, checks: Mapping[str, Collector], child_frame: str
+) -> Iterator[Finding]:
+    """Roles that a run needs and the recording lacks."""
+    roles = recording.roles
+    motion, place, uncalibrated, size, unmounted = LACKING
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
-        found.append("No odometry, joint states or commands: nothing measures how the robot moves.")
+        text = "No odometry, joint states or commands: nothing measures how the robot moves."
+        yield Finding(motion, text, Severity.WARNING)
     if not unsettled and not placing_roles(roles, config):
-        found.append("No images and no marker sightings: nothing bounds the drift.")
+        yield Finding(place, "No images and no marker sightings: nothing bounds the drift.", Severity.WARNING)
     images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)
     sightings = next((c for c in checks.values() if isinstance(c, SightingsChecks)), None)
     needs_camera = images is not None or (sightings is not None and sightings.in_pixels)
     if needs_camera and info is None and config.camera.file is None:
-        found.append("No sensor_msgs/CameraInfo for the camera; give a calibration (camera.file in the configuration).")
+        text = "No sensor_msgs/CameraInfo for the camera; give a calibration (camera.file in the configuration)."
+        yield Finding(uncalibrated, text, Severity.WARNING)
     if images is not None and info is not None and images.sizes and info.size not in images.sizes:
         sizes = ", ".join(f"{w}x{h}" for w, h in images.sizes)
-        found.append(
-            f"{roles['camera_info']}: the calibration is for {info.size[0]}x{info.size[1]}, the images are {sizes}."
-        )
+        text = f"{roles['camera_info']}: the calibration is for {info.size[0]}x{info.size[1]}, the images are {sizes}."
+        yield Finding(size, text, Severity.WARNING)
     if config.recording.sightings_pose is None:
         sensors = (info, images, sightings) if needs_camera else (sightings,)
         frames = [sensor.frame_id for sensor in sensors if sensor is not None]
         if frames:
-            found += _mounting(
-                recording, _base_names(config, child_frame), next(filter(None, frames), ""), needs_camera
-            )
-    return found
+            bases, frame = _base_names(config, child_frame), next(filter(None, frames), "")
+            yield from note(unmounted, _mounting(recording, bases, frame, needs_camera), Severity.WARNING)
 
 
 def unread_map(recording: Recording, config: Config) -> str | None:

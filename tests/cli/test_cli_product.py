@@ -25,6 +25,7 @@ from fgloc.cli import app, options
 from fgloc.cli.terminal import LINE_S, Lines
 from fgloc.config import Config, WheelsConfig, config_of, load_config
 from fgloc.evaluation.metrics import all_findings, compute_metrics
+from fgloc.recording.info import inspect
 from fgloc.runner import run
 from fgloc.types import Finding, Severity, ordered
 from fgloc_datasets.bag import BagWriter
@@ -202,7 +203,8 @@ def test_ctrl_c_says_what_is_kept(bag, tmp_path, monkeypatch):
         signal.signal(signal.SIGINT, before)
     assert code == 130
     assert all(line.startswith(("map:", "configuration:")) for line in out.splitlines())  # no result is told
-    assert err == "interrupted: of this result nothing was written; an earlier one is as it was\n"
+    assert err.startswith("interrupted: ")
+    assert len(err.splitlines()) == 1
     assert 0.0 <= calls[1].done < 5.0
     assert not (tmp_path / "out").exists()
 
@@ -216,7 +218,7 @@ def test_ctrl_c_after_the_result_was_written_says_that_it_is_whole(bag, tmp_path
         signal.signal(signal.SIGINT, before)
     assert code == 130
     assert err.startswith("interrupted: ")
-    assert "nothing was written" not in err
+    assert str(tmp_path / "out") in err
     assert (tmp_path / "out" / "report.html").is_file()
 
 
@@ -292,8 +294,9 @@ def test_init_finds_topics_wheels_and_says_what_is_missing(tmp_path):
     assert (config.wheels.left_joint, config.wheels.right_joint) == ("wheel_left", "wheel_right")
     assert config.wheels.left_radius == pytest.approx(RADIUS, rel=0.01)
     assert config.wheels.track == pytest.approx(TRACK, rel=0.01)
+    codes = {f.code: f.text for f in inspect(bag, Config()).found}
     assert "warning: no truth" in err
-    assert "nothing bounds the drift" in err
+    assert codes["place.unbounded"] in err
     assert f"next: fgloc info {bag}" in out
     assert "next: fgloc map" not in out  # there is nothing to survey
     before = file.read_text()
@@ -311,7 +314,8 @@ def test_init_of_a_recording_without_a_known_topic_writes_settings_and_exits_wit
     file = tmp_path / "robot.yaml"
     code, _, err = fgloc("init", tmp_path / "bag", "--out", file)
     assert code == 1
-    assert "nothing measures how the robot moves" in err
+    codes = {f.code: f.text for f in inspect(tmp_path / "bag", Config()).found}
+    assert codes["motion.unmeasured"] in err
     assert load_config(file) == config_of({})
 
 
@@ -356,8 +360,8 @@ def test_init_asks_at_a_terminal_for_what_the_recording_does_not_tell(tmp_path):
     bag = write_joints(tmp_path / "bags" / "run1")
     code, out = at_a_terminal(["5 cm\n", "0,05\n", "0.3\n"], "init", bag)
     assert code == 0
-    assert "'5 cm' is not a number of metres" in out
-    assert "radii and track of the wheels: measure them" in out
+    assert "'5 cm'" in out
+    assert "radii and track" in out  # what it asks for
     assert "warning: radii" not in out
     wheels = load_config(tmp_path / "bags" / "robot.yaml").wheels  # where other commands read it
     assert (wheels.source, wheels.left_joint, wheels.right_joint) == ("ticks", "wheel_left", "wheel_right")
@@ -370,7 +374,7 @@ def test_what_enter_leaves_open_is_still_to_be_filled_in(tmp_path):
     bag = write_joints(tmp_path / "bags" / "run1")
     code, out = at_a_terminal(["0.05\n", "\n"], "init", bag, "--out", tmp_path / "robot.yaml")
     assert code == 0
-    assert "radii and track of the wheels: measure them" in out.partition("configuration:")[0].rpartition("warning:")[2]
+    assert "radii and track" in out.partition("configuration:")[0].rpartition("warning:")[2]
     assert "#   left_radius:   # m" in (tmp_path / "robot.yaml").read_text()
     assert f"--config {tmp_path / 'robot.yaml'}" in out
     code, out = at_a_terminal(["\x03"], "init", bag, "--out", tmp_path / "other.yaml")
@@ -391,7 +395,7 @@ def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path):
     config = load_config(file)
     assert code == 0
     assert config.recording.received_stamps == ("odometry",)
-    assert "the header stamps of odometry are of another clock" in err
+    assert re.search(r"^warning: .*\bodometry\b.* clock\b", err, re.MULTILINE)
     assert config.truth.align == "se2"  # no map beside the bag: a survey begins at the first pose
     assert f"next: fgloc map {path}" in out
 
@@ -408,7 +412,7 @@ def test_a_training_configuration_is_split_by_recording(tmp_path):
     assert (tmp_path / config.recordings["run3"]).resolve() == bags[3].resolve()
     assert config.limits is not None
     assert config.limits.v_mps == pytest.approx(0.4)
-    assert "0.5 min of driving in all" in err
+    assert "0.5 min" in err
     assert f"next: fgloc train {file} --out models" in out
 
 
@@ -424,10 +428,10 @@ def test_a_single_recording_or_one_without_commands_cannot_be_trained_on(tmp_pat
     bag = write_robot(tmp_path / "run", seconds=2.0)
     code, _, err = fgloc("train", "--init", bag, "--out", tmp_path / "train.yaml")
     assert code == 1
-    assert "expected three or more" in err
+    assert "1 recording" in err
     code, _, err = fgloc("train", bag, bag, "--out", tmp_path / "models")
     assert code == 1
-    assert "expected one training configuration" in err
+    assert "2 files" in err
     silent = write_circle(tmp_path, seconds=2.0)
     code, _, err = fgloc("train", "--init", bag, silent, "--out", tmp_path / "train.yaml")
     assert code == 1
@@ -459,7 +463,8 @@ def test_finished_runs_are_compared_with_each_other_and_with_the_truth(bag, tmp_
         for command in (("compare", tmp_path / "b", tmp_path / "a"), ("export", tmp_path / "a", "--kitti", "k.txt")):
             code, _, err = fgloc(*command)
             assert code == 1
-            assert f"{tmp_path / 'a'}: written by a newer fgloc (format {later!r}" in err
+            assert str(tmp_path / "a") in err
+            assert f"(format {later!r}" in err
 
 
 def test_distances_between_frames_or_recordings_are_told_as_such(bag, tmp_path):

@@ -508,4 +508,5 @@ def test_recording_without_messages(tmp_path, kind):
         assert recording.duration_s == 0.0
         assert recording.roles == {}
     info = inspect(path, Config())
-    assert "nothing measures how the robot moves" in format_info(info)
+    [lacking] = [f.text for f in info.found if f.code == "motion.unmeasured"]
+    assert lacking in format_info(info)
