@@ -72,10 +72,11 @@ class RunState(Section):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resumed:
-    """State that was read, or one sentence on why none was."""
+    """State that was read, or one sentence on why none was, with its code (``state.damaged`` and so on)."""
 
     state: RunState | None
     note: str
+    code: str = ""
 
 
 def fingerprint(landmark_map: LandmarkMap | None) -> str:
@@ -110,18 +111,18 @@ def read_state(path: Path, map_fingerprint: str, remedy: str = _FRESH) -> Resume
         content = json.loads(read_text(path, OutputError, "give a file that `--state` wrote"))
         body, checksum = content["state"], content["sha256"]
     except (FglocError, ValueError, KeyError, TypeError, RecursionError) as error:
-        return Resumed(None, f"{path}: no saved state ({_short(error)}); {remedy}")
+        return Resumed(None, f"{path}: no saved state ({_short(error)}); {remedy}", "state.unreadable")
     if not isinstance(body, str) or checksum != _checksum(body):
-        return Resumed(None, f"{path}: damaged, its checksum does not fit; {remedy}")
+        return Resumed(None, f"{path}: damaged, its checksum does not fit; {remedy}", "state.damaged")
     try:
         state = RunState.model_validate_json(body)
     except ValidationError as error:
         wrong = ", ".join(".".join(map(str, e["loc"])) or e["msg"] for e in error.errors()[:3])
-        return Resumed(None, f"{path}: not a state of this version of fgloc ({wrong}); {remedy}")
+        return Resumed(None, f"{path}: not a state of this version of fgloc ({wrong}); {remedy}", "state.version")
     if state.map_fingerprint != map_fingerprint:
-        return Resumed(None, f"{path}: saved with another map than the one given; {remedy}")
+        return Resumed(None, f"{path}: saved with another map than the one given; {remedy}", "state.other_map")
     if problem := _problem(state):
-        return Resumed(None, f"{path}: {problem}; {remedy}")
+        return Resumed(None, f"{path}: {problem}; {remedy}", "state.covariance")
     return Resumed(state, "")
 
 

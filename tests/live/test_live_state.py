@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -52,6 +53,13 @@ def resumed(world, path, events, **options):
     return made, notes
 
 
+def known_m(note):
+    """How well [m] the pose is known after the gap, by the note on it; None: not at all."""
+    assert re.search(r"\b\d+\.\d s\b", note)  # the gap
+    known = re.findall(r"(\d+\.\d+) m\b", note)
+    return float(known[0]) if known else None
+
+
 def copied(path, tmp_path):
     """The state, to be written over."""
     target = tmp_path / "state.json"
@@ -62,7 +70,7 @@ def copied(path, tmp_path):
 def test_while_the_odometry_goes_on_it_tells_the_motion_of_the_gap(world, saved, tmp_path):
     blind = [e for e in between(world, GAP[1], 10.0) if e.topic != "/tags"]
     made, notes = resumed(world, copied(saved, tmp_path), blind, roles=("odometry", "command"))
-    assert "the odometry went on and has measured the motion since" in notes[0]
+    assert known_m(notes[0]) < 0.2  # at its speed it may have gone a metre and more
     assert errors(world, made[:1])[0] < 0.1
     assert made[0].mode is Mode.OK
     assert nees(made[0], world.truth(made[0].stamp_ns)) < 12.0
@@ -89,7 +97,7 @@ def test_an_odometry_that_was_set_to_zero_tells_nothing(world, saved, tmp_path):
 
     events = [zeroed(e) for e in between(world, GAP[1], 12.0)]
     made, notes = resumed(world, copied(saved, tmp_path), events)
-    assert "nothing has measured the motion since" in notes[0]
+    assert known_m(notes[0]) is None  # it may be anywhere that it can have driven to
     assert errors(world, made[5:]).max() < 0.1
     assert made[-1].mode is Mode.OK
 
@@ -104,7 +112,7 @@ def test_after_a_long_time_the_map_is_searched(world, saved, tmp_path):
         return dataclasses.replace(event, **later, **fresh)
 
     made, notes = resumed(world, copied(saved, tmp_path), [next_day(e) for e in between(world, 2.0, 6.0)])
-    assert "the pose is searched for on the whole map" in notes[0]
+    assert known_m(notes[0]) is None
     back = [dataclasses.replace(e, stamp_ns=e.stamp_ns - night) for e in made]
     assert errors(world, back[-10:]).max() < 0.06
 
@@ -143,20 +151,22 @@ def test_what_was_learned_goes_on(world, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("damage", "why"),
+    ("damage", "code"),
     [
-        (lambda text: text[: len(text) // 2], "no saved state"),
-        (lambda text: "", "no saved state"),
-        (lambda text: "[1, 2]", "no saved state"),
-        (lambda text: text.replace("0.", "1.", 1), "its checksum does not fit"),
-        (lambda text: json.dumps({"state": "{}", "sha256": "0"}), "its checksum does not fit"),
+        (lambda text: text[: len(text) // 2], "state.unreadable"),
+        (lambda text: "", "state.unreadable"),
+        (lambda text: "[1, 2]", "state.unreadable"),
+        (lambda text: text.replace("0.", "1.", 1), "state.damaged"),
+        (lambda text: json.dumps({"state": "{}", "sha256": "0"}), "state.damaged"),
     ],
 )
-def test_a_damaged_file_is_refused_and_replaced(world, saved, tmp_path, damage, why):
+def test_a_damaged_file_is_refused_and_replaced(world, saved, tmp_path, damage, code):
     path = copied(saved, tmp_path)
     path.write_text(damage(path.read_text(encoding="utf-8")), encoding="utf-8")
+    read = read_state(path, fingerprint(world.map))
+    assert (read.state, read.code) == (None, code)
     made, notes = resumed(world, path, between(world, GAP[1], 10.5))
-    assert [n for n in notes if why in n and "the start is fresh" in n]
+    assert read.note in notes
     assert errors(world, made[-3:]).max() < 0.08
     assert read_state(path, fingerprint(world.map)).state is not None
 
@@ -170,29 +180,30 @@ def with_content(path, **changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "why"),
+    ("changes", "code"),
     [
-        ({"version": 2}, "not a state of this version"),
-        ({"format": "another"}, "not a state of this version"),
-        ({"extra": 1}, "not a state of this version"),
-        ({"pose": [0.0, 0.0]}, "not a state of this version"),
-        ({"cov": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}, "the covariance of the pose is none"),
-        ({"cov": [[0, 0, 0], [0, 0, 0], [0, 0, 0]]}, "the covariance of the pose is none"),
-        ({"installation": {"names": ["a"], "mean": [0.0], "cov": [[1.0, 2.0]]}}, "do not fit"),
+        ({"version": 2}, "state.version"),
+        ({"format": "another"}, "state.version"),
+        ({"extra": 1}, "state.version"),
+        ({"pose": [0.0, 0.0]}, "state.version"),
+        ({"cov": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}, "state.covariance"),
+        ({"cov": [[0, 0, 0], [0, 0, 0], [0, 0, 0]]}, "state.covariance"),
+        ({"installation": {"names": ["a"], "mean": [0.0], "cov": [[1.0, 2.0]]}}, "state.covariance"),
     ],
 )
-def test_values_that_cannot_be_used_are_refused(world, saved, tmp_path, changes, why):
+def test_values_that_cannot_be_used_are_refused(world, saved, tmp_path, changes, code):
     path = copied(saved, tmp_path)
     with_content(path, **changes)
     read = read_state(path, fingerprint(world.map))
-    assert read.state is None
-    assert why in read.note
+    assert (read.state, read.code) == (None, code)
+    [key] = changes
+    assert code != "state.version" or key in read.note
 
 
 def test_a_state_of_another_map_is_refused(saved):
     read = read_state(saved, fingerprint(beacons()))
-    assert read.state is None
-    assert "saved with another map" in read.note
+    assert (read.state, read.code) == (None, "state.other_map")
+    assert str(saved) in read.note
 
 
 def test_without_a_pose_an_old_state_is_kept(world, saved, tmp_path):
@@ -209,7 +220,7 @@ def test_a_file_that_cannot_be_written_is_told(world, tmp_path):
     target.mkdir()
     live = live_in(world, state=None)
     feed(live, between(world, 0.0, 3.0))
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match=re.escape(str(target))):
         live.save(target)
     assert live.save(tmp_path / "state.json")
     live.close()
