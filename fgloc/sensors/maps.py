@@ -338,7 +338,9 @@ def _orientation(key: str, item: Item) -> FloatArray:
     if key == "rpy":
         roll, pitch, yaw = item.numbers(3)
         if max(abs(roll), abs(pitch), abs(yaw)) > 2.0 * np.pi:
-            raise item.fail(f"rpy {[roll, pitch, yaw]} is more than a turn; expected radians, not degrees")
+            raise item.fail(
+                f"rpy {[float(roll), float(pitch), float(yaw)]} is more than a turn; expected radians, not degrees"
+            )
         return rpy_matrix(roll, pitch, yaw)
     return quaternion_matrix(_unit(item, item.numbers(4)))
 

@@ -10,6 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from refusal import refusal
 
 from fgloc.errors import RecordingError
 from fgloc_datasets.convert import Remote, fetch, unpack
@@ -61,9 +62,9 @@ def test_a_server_that_tells_no_length_will_do(server: str, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "size", "sha256", "says"),
     [
-        ("cut.zip", None, None, "expected 76900"),
-        ("set.zip", 70_000, None, "more than the expected 70000"),
-        ("set.zip", 80_000, None, "expected 80000"),
+        ("cut.zip", None, None, " 76900"),
+        ("set.zip", 70_000, None, " 70000"),
+        ("set.zip", 80_000, None, " 80000"),
         ("set.zip", None, "00" * 32, "sha256"),
         ("missing.zip", None, None, "Not Found"),
     ],
@@ -87,7 +88,7 @@ def test_fault_71_an_interrupted_download_keeps_the_old_file(server: str, tmp_pa
     "url", ["http://example.com/set.zip", "file:///etc/passwd", "https://example.com/", "set.zip", "http://[::2]/x.zip"]
 )
 def test_other_addresses_are_refused(url: str, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="expected an https address"):
+    with refusal(RecordingError, url, "https"):
         fetch(Remote(url), tmp_path)
 
 
@@ -108,7 +109,7 @@ def test_an_archive_is_unpacked_whole(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["../out.dat", "/out.dat", "a/../../out.dat", "..\\out.dat", "C:\\out.dat"])
 def test_fault_65_an_archive_cannot_write_outside(name: str, tmp_path: Path) -> None:
     archive = _archive(tmp_path / "set.zip", {"a.dat": b"1", name: b"2"})
-    with pytest.raises(RecordingError, match="leads out of the folder"):
+    with refusal(RecordingError, archive, repr(name)):
         unpack(archive, tmp_path / "files" / "set")
     assert list((tmp_path / "files").iterdir()) == []
     assert not (tmp_path / "out.dat").exists()
@@ -119,12 +120,12 @@ def test_fault_65_an_archive_cannot_hold_links(tmp_path: Path) -> None:
         link = zipfile.ZipInfo("link")
         link.external_attr = 0o120777 << 16
         file.writestr(link, "/etc")
-    with pytest.raises(RecordingError, match="leads out of the folder"):
+    with refusal(RecordingError, tmp_path / "set.zip", "link"):
         unpack(tmp_path / "set.zip", tmp_path / "set")
 
 
 def test_a_damaged_archive_is_named(tmp_path: Path) -> None:
     archive = _archive(tmp_path / "set.zip", {"a.dat": bytes(1000)})
     archive.write_bytes(archive.read_bytes()[:-30])
-    with pytest.raises(RecordingError, match=r"set\.zip: not a whole zip file"):
+    with refusal(RecordingError, archive, cause=zipfile.BadZipFile):
         unpack(archive, tmp_path / "set")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import math
 import os
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from dataset_files import header_ns, read_back
 from real_data import real_data
+from refusal import refusal
 
 from fgloc.config import load_config
 from fgloc.errors import RecordingError
@@ -112,26 +114,25 @@ def testspans() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "fact"),
     [
-        (None, "cannot be read"),
-        ("a,b\n1,2\n", "no column window"),
-        (",".join(_COLUMNS) + "\n", "holds no rows"),
-        (",".join(_COLUMNS) + "\n" + ",".join(["x"] * len(_COLUMNS)) + "\n", "columns of numbers"),
-        (",".join(_COLUMNS) + "\n" + ",".join(["-1"] * len(_COLUMNS)) + "\n", "not a count"),
+        (None, os.strerror(errno.ENOENT)),
+        ("a,b\n1,2\n", ", ".join(_COLUMNS)),
+        (",".join(_COLUMNS) + "\n", f" {len(_COLUMNS)} columns"),
+        (",".join(_COLUMNS) + "\n" + ",".join(["x"] * len(_COLUMNS)) + "\n", "'x'"),
+        (",".join(_COLUMNS) + "\n" + ",".join(["-1"] * len(_COLUMNS)) + "\n", "column window"),
     ],
 )
-def test_a_wrong_file_is_named(tmp_path: Path, content: str | None, says: str) -> None:
+def test_a_wrong_file_is_named(tmp_path: Path, content: str | None, fact: str) -> None:
     if content is not None:
         (tmp_path / "w.csv").write_text(content)
-    with pytest.raises(RecordingError, match=says) as caught:
+    with refusal(RecordingError, tmp_path / "w.csv", fact):
         convert(tmp_path / "w.csv", tmp_path / "out")
-    assert "w.csv" in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
 def test_an_empty_selection_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="no window is selected; it has windows 0 to 3"):
+    with pytest.raises(RecordingError, match=r"\b0\b.*\b3\b"):
         convert(_table(tmp_path / "w.csv"), tmp_path / "out", windows=range(90, 99))
 
 

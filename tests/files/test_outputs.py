@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+from refusal import refusal
 from run_results import START_NS, figure_eight
 
 from fgloc.errors import OutputError, TrajectoryError
@@ -47,40 +48,38 @@ def test_tum_of_others_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "fact"),
     [
-        (LINE + "2.0 nan 0 0 0 0 0 1\n", "line 2: 'nan' is not a finite number"),
-        (LINE + "\n3.0 0 0 0 0 0 0 inf\n", "line 3: 'inf' is not a finite number"),
-        (LINE + "2.0 0 0 0 0 0 x 1\n", "line 2: 'x' is not a finite number"),
-        ("1.0 2.0 3.0\n", "line 1: 3 values, expected the 8"),
-        (LINE + LINE, "line 2: stamp 1.0 does not come after 1.000000000"),
-        (LINE + "0.5 0 0 0 0 0 0 1\n", "line 2: stamp 0.5 does not come after"),
-        ("1.0 0 0 0 0 0 0 0\n", "line 1: quaternion 0 0 0 0 has length 0"),
-        ("1e12 0 0 0 0 0 0 1\n", "line 1: stamp 1e12 is out of range"),
-        ("# nothing\n", "no pose in it"),
+        (LINE + "2.0 nan 0 0 0 0 0 1\n", "line 2: 'nan' "),
+        (LINE + "\n3.0 0 0 0 0 0 0 inf\n", "line 3: 'inf' "),
+        (LINE + "2.0 0 0 0 0 0 x 1\n", "line 2: 'x' "),
+        ("1.0 2.0 3.0\n", "line 1: 3 "),
+        (LINE + LINE, "line 2: stamp 1.0 "),
+        (LINE + "0.5 0 0 0 0 0 0 1\n", "line 2: stamp 0.5 "),
+        ("1.0 0 0 0 0 0 0 0\n", "line 1: quaternion 0 0 0 0 "),
+        ("1e12 0 0 0 0 0 0 1\n", "line 1: stamp 1e12 "),
+        ("# nothing\n", "t x y z qx qy qz qw"),
     ],
 )
-def test_wrong_tum_is_refused_with_its_line(tmp_path, text, message):
+def test_wrong_tum_is_refused_with_its_line(tmp_path, text, fact):
     path = tmp_path / "a.tum"
     path.write_text(text)
-    with pytest.raises(TrajectoryError) as caught:
+    with refusal(TrajectoryError, path, fact):
         outputs.read_tum(path)
-    assert str(path) in str(caught.value)
-    assert message in str(caught.value)
 
 
 def test_missing_or_binary_tum_is_refused(tmp_path):
-    with pytest.raises(TrajectoryError, match=r"absent\.tum: cannot be read"):
+    with refusal(TrajectoryError, tmp_path / "absent.tum", cause=FileNotFoundError):
         outputs.read_tum(tmp_path / "absent.tum")
     (tmp_path / "b.tum").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(TrajectoryError, match="not a text file"):
+    with refusal(TrajectoryError, tmp_path / "b.tum", cause=UnicodeDecodeError):
         outputs.read_tum(tmp_path / "b.tum")
 
 
 def test_nan_pose_is_not_written(tmp_path):
     path = tmp_path / "a.tum"
     path.write_text("old")
-    with pytest.raises(TrajectoryError, match=r"pose 1 is \[nan, 0.0, 0.0\]"):
+    with pytest.raises(TrajectoryError, match=r"\b1\b.*\[nan, 0.0, 0.0\]"):
         outputs.write_tum(path, Trajectory(np.array([1, 2]), np.array([[0.0, 0, 0], [np.nan, 0, 0]])))
     assert path.read_text() == "old"
 
@@ -95,7 +94,7 @@ def test_covariance_csv(tmp_path):
     cov = result.trajectory.covs[3]
     written = [float(rows[3][name]) for name in ("xx", "xy", "xθ", "yy", "yθ", "θθ")]
     np.testing.assert_allclose(written, cov[np.triu_indices(3)], rtol=1e-9, atol=1e-15)
-    with pytest.raises(TrajectoryError, match="no covariances"):
+    with refusal(TrajectoryError, tmp_path / "d.csv"):
         outputs.write_covariance_csv(tmp_path / "d.csv", Trajectory(np.array([1]), np.zeros((1, 3))))
 
 
@@ -115,7 +114,7 @@ def test_steps_csv_has_a_row_per_decision(tmp_path):
 def test_json_refuses_nan(tmp_path):
     path = tmp_path / "m.json"
     outputs.write_json(path, {"a": None, "b": 1.5})
-    with pytest.raises(OutputError, match=r"m.json: not representable as JSON"):
+    with refusal(OutputError, path, cause=ValueError):
         outputs.write_json(path, {"a": float("nan")})
     assert json.loads(path.read_text()) == {"a": None, "b": 1.5}
 
@@ -130,9 +129,7 @@ def test_fault_71_disk_full_keeps_the_old_result(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(
-        OutputError, match=r"trajectory.tum: cannot be written \(No space left on device\); the old file is kept"
-    ):
+    with refusal(OutputError, path, os.strerror(errno.ENOSPC)):
         outputs.write_tum(path, figure_eight().trajectory)
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["trajectory.tum"]
@@ -172,7 +169,7 @@ def test_fault_71_an_error_in_the_last_file_keeps_the_whole_old_folder(tmp_path)
 
 def test_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"file/out.txt: cannot be written \(Not a directory\)|File exists"):
+    with refusal(OutputError, tmp_path / "file" / "out.txt", cause=OSError):
         outputs.write_text(tmp_path / "file" / "out.txt", "x")
 
 

@@ -3,10 +3,12 @@
 import os
 import time
 from collections import Counter
+from pathlib import Path
 
 import pytest
 import yaml
 from pydantic_core import to_jsonable_python
+from refusal import refusal
 
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.config import Config, config_of, load_config, setting
@@ -65,20 +67,20 @@ def test_every_default_is_within_its_bounds():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("wheels:\n  track: 0.3\n  trak: 0.4\n", r"robot.yaml:3: wheels.trak: unknown key; did you mean 'track'\?"),
-        ("gyro: {}\nwheel: {track: 0.3}\n", r"robot.yaml:2: wheel: unknown key; did you mean 'wheels'\?"),
-        ("wheels:\n  source: tick\n", r"robot.yaml:2: wheels.source: expected 'auto', 'twist'"),
+        ("wheels:\n  track: 0.3\n  trak: 0.4\n", r"robot.yaml:3: wheels.trak: .*'track'"),
+        ("gyro: {}\nwheel: {track: 0.3}\n", r"robot.yaml:2: wheel: .*'wheels'"),
+        ("wheels:\n  source: tick\n", r"robot.yaml:2: wheels.source: .*'auto', 'twist'"),
         (
             "expert:\n wheels:\n  noise:\n    x_per_sqrt_mm: 1\n",
-            r"robot.yaml:4: expert.wheels.noise.x_per_sqrt_mm.*'x_per_sqrt_m'\?",
+            r"robot.yaml:4: expert.wheels.noise.x_per_sqrt_mm: .*'x_per_sqrt_m'",
         ),
-        ("expert:\n gate:\n\n  max_speed: fast\n", r"robot.yaml:4: expert.gate.max_speed: .*number.*got 'fast'"),
-        ("wheels: {source: tick}\n", r"^\S*robot.yaml:1: wheels.source: .*; did you mean 'ticks'\?"),
-        ("wheels: 3\n", r"robot.yaml:1: wheels: expected keys with values \(got 3\)"),
-        ("expert: {motion: {use: perhaps}}\n", r"robot.yaml:1: expert.motion.use: expected true or false"),
-        ("size: 0.2\nlandmarks:\n- {id: 0}\n", r"robot.yaml is a map, .* --map"),
-        ("a: 1\na: 2\n", r"robot.yaml:2: key 'a' is given twice"),
-        ("x: !!int ''\n", r"robot.yaml:1: '' is not a value of kind int"),
+        ("expert:\n gate:\n\n  max_speed: fast\n", r"robot.yaml:4: expert.gate.max_speed: .*'fast'"),
+        ("wheels: {source: tick}\n", r"^\S*robot.yaml:1: wheels.source: .*'ticks'\? .*'tick'"),
+        ("wheels: 3\n", r"robot.yaml:1: wheels: .*\b3\b"),
+        ("expert: {motion: {use: perhaps}}\n", r"robot.yaml:1: expert.motion.use: .*true.*false"),
+        ("size: 0.2\nlandmarks:\n- {id: 0}\n", r"robot.yaml.* --map"),
+        ("a: 1\na: 2\n", r"robot.yaml:2: .*'a'"),
+        ("x: !!int ''\n", r"robot.yaml:1: ''.*\bint\b"),
     ],
 )
 def test_errors_name_line_key_and_correction(write, text, said):
@@ -141,7 +143,7 @@ def test_many_misplaced_values_are_replaced_by_one_block(write):
     assert (config.wheels.hold_s, config.gate.max_speed) == (0.3, 2.0)
     wrong, bag = "{name: v, config: {wheels: {hold_s: 0.3}}}", write("", "a.bag")
     suite = write(f"title: t\nrecordings: [{{name: a, bag: a.bag}}]\nvariants: [{wrong}]\n", "suite.yaml")
-    with pytest.raises(ConfigError, match=r"variant 'v'.*configuration\n.*is now expert.wheels.hold_s"):
+    with pytest.raises(ConfigError, match=r"'v'.*\n.*wheels.hold_s.*expert.wheels.hold_s"):
         expand(load_suite(suite), bag.parent)
 
 
@@ -150,24 +152,23 @@ def test_suite_errors_name_line_and_correction(write):
         "title: t\nrecordings:\n  - {name: a, bag: b}\nfailures:\n  - name: f\n    chain:\n"
         "      - {kind: darkness, gian: 0.5}\n"
     )
-    with pytest.raises(ConfigError, match=r"suite.yaml:7: .*gian: unknown key; did you mean 'gain'\?"):
+    with pytest.raises(ConfigError, match=r"suite.yaml:7: .*gian: .*'gain'"):
         load_suite(write(text, "suite.yaml"))
     unknown = text.replace("darkness, gian: 0.5", "darknes")
-    with pytest.raises(
-        ConfigError, match=r"^\S*suite.yaml:7: \S*: there is no kind 'darknes'; did you mean 'darkness'\?$"
-    ):
+    with pytest.raises(ConfigError, match=r"^\S*suite.yaml:7: .*'darknes'.*'darkness'\?$"):
         load_suite(write(unknown, "suite.yaml"))
     many = text.replace("gian", "gain") + f"seeds: {list(range(1000))}\nvariants:\n"
     many += "".join(f"  - {{name: v{i}}}\n" for i in range(2000))
-    with pytest.raises(ConfigError, match="asks for 2002000 runs"):
+    with pytest.raises(ConfigError, match=r"\b2002000\b"):
         load_suite(write(many, "suite.yaml"))
 
 
 @pytest.mark.parametrize("text", [SYNTAX[name] for name in ("alias bomb", "merge bomb", "alias chain", "deep lists")])
 def test_fault_65_bombs_are_refused_by_every_reader(write, text):
     for read in (load_config, load_suite, load_map):
-        with pytest.raises(FglocError, match=r"stand for more|nested deeper"):
-            read(write(text))
+        path = write(text)
+        with refusal(FglocError, path, cause=HostileError):
+            read(path)
 
 
 def test_harmless_aliases_are_followed():
@@ -196,17 +197,14 @@ def test_values_are_those_of_yaml():
 @pytest.mark.parametrize("read", [load_config, load_suite, load_map, read_tum])
 def test_only_regular_files_are_read(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, tmp_path / "pipe", tmp_path / "a\0b", tmp_path / ("a" * 300)):
-        with pytest.raises((ConfigError, MapError, TrajectoryError)):
+    endless = [Path("/dev/zero")] if os.path.exists("/dev/zero") else []
+    for path in (tmp_path, tmp_path / "pipe", tmp_path / "a\0b", tmp_path / ("a" * 300), *endless):
+        with pytest.raises((ConfigError, MapError, TrajectoryError)) as caught:
             read(path)
-    if os.path.exists("/dev/zero"):
-        from pathlib import Path
-
-        with pytest.raises(FglocError, match="not a regular file"):
-            read(Path("/dev/zero"))
+        assert path.name in str(caught.value).replace("\\x00", "\0")
 
 
 def test_dictionary_file_that_never_ends_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.yml")
-    with pytest.raises(ConfigError, match="not a regular file"):
+    with refusal(ConfigError, tmp_path / "pipe.yml"):
         load_dictionary(str(tmp_path / "pipe.yml"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from marker_scenes import forward_camera, project, standing
 from real_data import real_data
+from refusal import refusal
 
 from fgloc.errors import CameraError
 from fgloc.sensors.cameras import camera_from_info, load_camera, pinhole, rescaled, undistort_points, without_distortion
@@ -63,19 +65,19 @@ def test_fault_38_empty_distortion_is_zero_and_said(model: str) -> None:
     assert c.model == (model or "plumb_bob")
     assert c.D.tolist() == [0.0] * 4
     [note] = c.notes
-    assert "no distortion coefficients" in note
+    assert "distortion" in note
 
 
 @pytest.mark.parametrize(
     ("model", "D"), [("plumb_bob", (0.1,)), ("equidistant", (0.1,) * 5), ("plumb_bob", (np.nan,) * 5)]
 )
 def test_impossible_distortion_is_refused(model: str, D: tuple[float, ...]) -> None:
-    with pytest.raises(CameraError, match=r"distortion coefficients|not finite"):
+    with pytest.raises(CameraError, match=str(len(D))):
         camera_from_info(info(D=D, model=model), T)
 
 
 def test_unknown_distortion_model_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(CameraError, match=r"'fov' is not known.*plumb_bob.*equidistant"):
+    with pytest.raises(CameraError, match=r"'fov'.*plumb_bob.*equidistant"):
         camera_from_info(info(model="fov"), T)
 
 
@@ -91,7 +93,7 @@ def test_fault_39_rescaled_calibration_sees_the_same_rays(scale: float) -> None:
 
 
 def test_fault_39_another_shape_is_refused() -> None:
-    with pytest.raises(CameraError, match="640x480 cannot be scaled to 640x360"):
+    with pytest.raises(CameraError, match=r"640x480 .* 640x360"):
         rescaled(camera("plumb_bob"), 640, 360)
 
 
@@ -179,23 +181,25 @@ def test_calibration_files_give_the_same_camera(tmp_path: Path, text: str) -> No
 
 def test_kalibr_camera_can_be_chosen(tmp_path: Path) -> None:
     path = written(tmp_path, KALIBR)
-    assert "cam0 is used, not cam1" in load_camera(path, T).notes[-1]
+    first = load_camera(path, T)
+    assert (first.model, first.width) == ("plumb_bob", 640)
+    assert re.search("cam0 .*cam1", first.notes[-1])
     second = load_camera(path, T, "cam1")
     assert (second.model, second.width, second.notes) == ("equidistant", 320, ())
-    with pytest.raises(CameraError, match="no camera 'cam2'; there are cam0, cam1"):
+    with pytest.raises(CameraError, match=r"'cam2'.*cam0, cam1"):
         load_camera(path, T, "cam2")
 
 
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("camera_matrix: [1, 2]", "camera.yaml:1: expected keys"),
-        (ROS.replace("640", "wide"), r"camera.yaml:2: expected a number, got 'wide'"),
-        (ROS.replace("525.0, 0, 319.5, 0, 520.0, 239.5, 0, 0, 1]", "0, 0, 0, 0, 0, 0, 0, 0, 0]", 1), "all zeros"),
-        (KALIBR.replace("pinhole", "omni", 1), r"camera.yaml:3.*'omni' is not supported"),
-        ("a: 1", "expected camera_matrix"),
+        ("camera_matrix: [1, 2]", r"camera\.yaml:1: "),
+        (ROS.replace("640", "wide"), r"camera\.yaml:2: .*'wide'"),
+        (ROS.replace("525.0, 0, 319.5, 0, 520.0, 239.5, 0, 0, 1]", "0, 0, 0, 0, 0, 0, 0, 0, 0]", 1), "K.* zeros"),
+        (KALIBR.replace("pinhole", "omni", 1), r"camera\.yaml:3.*'omni'"),
+        ("a: 1", "camera_matrix"),
         ("", "empty"),
-        ("%YAML:1.0\n---\na: 1\n", "expected camera_matrix"),
+        ("%YAML:1.0\n---\na: 1\n", "camera_matrix"),
         ("{", "not YAML"),
     ],
 )
@@ -205,7 +209,7 @@ def test_wrong_calibration_files_are_refused_with_the_place(tmp_path: Path, text
 
 
 def test_missing_calibration_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CameraError, match=r"absent.yaml: cannot be read"):
+    with refusal(CameraError, tmp_path / "absent.yaml", cause=FileNotFoundError):
         load_camera(tmp_path / "absent.yaml", T)
 
 
@@ -216,7 +220,7 @@ def test_opencvs_own_calibrations_are_read() -> None:
     assert abs(c.K[0, 0] - 452.51072) < 1e-4
     sizeless = load_camera(real_data("marker_images", "opencv_aruco", "tutorial_camera_params.yml"), T)
     assert sizeless.width == 0
-    assert "no image size" in sizeless.notes[0]
+    assert "size" in sizeless.notes[0]
 
 
 @pytest.mark.parametrize("head", ["", "%YAML:1.0\n---\n", "a: !!opencv-matrix\n"])

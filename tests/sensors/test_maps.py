@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from real_data import real_data
+from refusal import refusal
 from scipy.spatial.transform import Rotation
 
 from fgloc.config import Config, load_config
 from fgloc.errors import MapError
+from fgloc.files.documents import HostileError
 from fgloc.graph.installation import MARKER, installation_of
 from fgloc.recording.reader import Recording
 from fgloc.sensor_setup import recorded_setup
@@ -56,7 +60,7 @@ def test_a_default_size_fills_what_the_file_leaves_open(tmp_path: Path) -> None:
     sizes = {i: m.size_m for i, m in load_map(written(tmp_path, bare), 0.3).landmarks.items()}
     assert sizes == {0: 0.3, 3: 0.15, 4: 0.3, 7: 0.0}
     [note] = load_map(written(tmp_path, bare)).notes
-    assert "[0, 4] have no size" in note
+    assert "[0, 4]" in note
 
 
 def test_fault_54_id_0_works_like_any_other(tmp_path: Path) -> None:
@@ -112,17 +116,17 @@ landmarks:
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"),
+    ("fields", "facts"),
     [
-        ("facing: 0, sigma_m: 0", "expected more than 0"),
-        ("sigma_m: 0.1, sigma_rad: 0.1", "without an orientation"),
-        ("facing: 0, sigma_rad: 0.1", "without sigma_m"),
-        ("facing: 0, sigma_m: 0.1, cov: [[1, 0], [0, 1]]", "not both"),
-        ("cov: [[1, 0, 0], [0, 1]]", "is not a covariance"),
+        ("facing: 0, sigma_m: 0", r"\[0\.0, 0\.0, 0\.0\]"),
+        ("sigma_m: 0.1, sigma_rad: 0.1", "sigma_rad .*orientation"),
+        ("facing: 0, sigma_rad: 0.1", "sigma_rad .*sigma_m"),
+        ("facing: 0, sigma_m: 0.1, cov: [[1, 0], [0, 1]]", "cov .*sigma_m .*sigma_rad"),
+        ("cov: [[1, 0, 0], [0, 1]]", "cov .*2"),
     ],
 )
-def test_sigmas_that_are_none(tmp_path: Path, fields: str, message: str) -> None:
-    with pytest.raises(MapError, match=message):
+def test_sigmas_that_are_none(tmp_path: Path, fields: str, facts: str) -> None:
+    with pytest.raises(MapError, match=rf"map\.yaml:2: .*{facts}"):
         load_map(written(tmp_path, f"landmarks:\n  - {{id: 1, position: [1, 2, 0.5], {fields}}}\n"))
 
 
@@ -208,52 +212,53 @@ def test_the_turtlebots_map_is_read() -> None:
 
 
 def refused(tmp_path: Path, text: str, match: str, name: str = "map.yaml") -> None:
-    with pytest.raises(MapError, match=match):
+    """The error names the file, and what `match` has: line, key, value."""
+    with pytest.raises(MapError, match=rf"{name}.*{match}"):
         load_map(written(tmp_path, text, name))
 
 
 def test_fault_53_duplicate_id_names_both_lines(tmp_path: Path) -> None:
-    refused(tmp_path, OURS.replace("id: 7", "id: 3"), r"map.yaml:7: landmark id 3 is already in line 5")
+    refused(tmp_path, OURS.replace("id: 7", "id: 3"), r":7: .*\b3\b.* 5\b")
 
 
 def test_fault_53_duplicate_id_in_json_names_both_lines(tmp_path: Path) -> None:
     data = wpilib()
     data["tags"][1]["ID"] = 1  # type: ignore[index]
-    refused(tmp_path, json.dumps(data, indent=1), r"field.json:2\d: landmark id 1 is already in line 3", "field.json")
+    refused(tmp_path, json.dumps(data, indent=1), r":2\d: .*\b1\b.* 3\b", "field.json")
 
 
 def test_fault_53_duplicate_key_names_both_lines(tmp_path: Path) -> None:
-    refused(tmp_path, OURS + "size: 0.3\n", r"key 'size' stands in line 2 and again in line 8")
+    refused(tmp_path, OURS + "size: 0.3\n", r"'size'.* 2 .* 8\b")
 
 
-@pytest.mark.parametrize(("size", "hint"), [("20", r"20 cm, write 0\.2"), ("200", r"200 mm, write 0\.2")])
+@pytest.mark.parametrize(("size", "hint"), [("20", "20 cm"), ("200", "200 mm")])
 def test_fault_41_marker_size_in_cm(tmp_path: Path, size: str, hint: str) -> None:
-    refused(tmp_path, OURS.replace("size: 0.2", f"size: {size}"), rf"map.yaml:2: .*too large.*metres.*{hint}")
+    refused(tmp_path, OURS.replace("size: 0.2", f"size: {size}"), rf":2: .*{hint}.* 0\.2$")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
-        ("4.0, 1.5", ".nan, 1.5", r"map.yaml:4: expected a number, got '.nan'"),
-        ("4.0, 1.5", "nan, 1.5", r"map.yaml:4: expected a finite number, got 'nan'"),
-        ("4.0, 1.5", ".inf, 1.5", r"map.yaml:4: expected a"),
-        ("4.0, 1.5", "1e300, 1.5", r"map.yaml:4: .*out of bounds"),
-        ("id: 0", "id: -1", r"map.yaml:4: landmark id -1 is negative"),
-        ("id: 0", "id: 1.5", r"map.yaml:4: expected a whole number, got '1.5'"),
-        ("id: 0, ", "", r"map.yaml:4: 'id' is missing"),
-        ("[1, 0, 0, 0]", "[1, 1, 0, 0]", r"map.yaml:6: quaternion .* length 1.41, expected 1"),
-        ("[1, 0, 0, 0]", "[0, 0, 0, 0]", r"map.yaml:6: quaternion .* length 0"),
-        ("[1, 0, 0, 0]", "[1, 0, 0]", r"map.yaml:6: expected 4 numbers, got 3"),
-        ("rpy: [0, 0, 0]", "rpy: [0, 0, 90]", r"map.yaml:5: .*radians, not degrees"),
-        ("facing: 3.14", "rpy: [0, 0, 0], facing: 3.14", r"map.yaml:4: orientation given 2 times"),
-        ("position: [2.0, 2.5]", "position: [2.0, 2.5], size: 0.2", r"map.yaml:7: .*size but no orientation"),
-        ("position: [1, 2, 0]", "position: [1, 2]", r"map.yaml:5: .*position of x, y, z"),
-        ("0.02]]", "-0.02]]", r"map.yaml:7: cov .* is not a covariance"),
-        ("[0.002, 0.02]", "[0.003, 0.02]", r"map.yaml:7: cov .* is not a covariance"),
-        ("size: 0.15", "side: 0.15", r"map.yaml:5: unknown key 'side'; known are id"),
-        ("size: 0.15", "size: 0", r"map.yaml:5: marker size 0 m"),
-        ("DICT_4X4_50", "DICT_4X4_51", r"map.yaml:1: .*'DICT_4X4_51' is not known.*DICT_4X4_50"),
-        ("landmarks:", "markers:", r"expected 'landmarks'"),
+        ("4.0, 1.5", ".nan, 1.5", r":4: .*'\.nan'"),
+        ("4.0, 1.5", "nan, 1.5", r":4: .*'nan'"),
+        ("4.0, 1.5", ".inf, 1.5", r":4: .*'\.inf'"),
+        ("4.0, 1.5", "1e300, 1.5", r":4: .*\[1e\+300, 1\.5, 0\.5\]"),
+        ("id: 0", "id: -1", r":4: .* -1 "),
+        ("id: 0", "id: 1.5", r":4: .*'1\.5'"),
+        ("id: 0, ", "", r":4: 'id' .*position, facing"),
+        ("[1, 0, 0, 0]", "[1, 1, 0, 0]", r":6: quaternion .* 1\.41\b.* 1\b"),
+        ("[1, 0, 0, 0]", "[0, 0, 0, 0]", r":6: quaternion .* 0, .* 1\b"),
+        ("[1, 0, 0, 0]", "[1, 0, 0]", r":6: .*\b4\b.*\b3\b"),
+        ("rpy: [0, 0, 0]", "rpy: [0, 0, 90]", r":5: rpy \[0\.0, 0\.0, 90\.0\].*radians"),
+        ("facing: 3.14", "rpy: [0, 0, 0], facing: 3.14", r":4: .*\b2\b.*facing, rpy"),
+        ("position: [2.0, 2.5]", "position: [2.0, 2.5], size: 0.2", r":7: .*\b7\b.*size.*facing"),
+        ("position: [1, 2, 0]", "position: [1, 2]", r":5: .*position.*x, y, z"),
+        ("0.02]]", "-0.02]]", r":7: cov .*-0\.02"),
+        ("[0.002, 0.02]", "[0.003, 0.02]", r":7: cov .*0\.003"),
+        ("size: 0.15", "side: 0.15", r":5: .*'side'.*\bid, .*\bsize\b"),
+        ("size: 0.15", "size: 0", r":5: .*\b0 m\b"),
+        ("DICT_4X4_50", "DICT_4X4_51", r":1: .*'DICT_4X4_51'.*DICT_4X4_50"),
+        ("landmarks:", "markers:", r":1: .*'landmarks'.*dictionary, size, markers"),
     ],
 )
 def test_wrong_maps_are_refused_with_the_line(tmp_path: Path, old: str, new: str, match: str) -> None:
@@ -264,44 +269,48 @@ def test_wrong_maps_are_refused_with_the_line(tmp_path: Path, old: str, new: str
 def test_rotation_that_is_none_is_refused_in_json(tmp_path: Path) -> None:
     data = wpilib()
     data["tags"][0]["pose"]["rotation"]["quaternion"]["W"] = 3.0  # type: ignore[index]
-    refused(tmp_path, json.dumps(data), "length 3.1", "field.json")
+    refused(tmp_path, json.dumps(data), r":1: .* 3\.1", "field.json")
 
 
 @pytest.mark.parametrize(
-    ("text", "match"),
+    ("text", "cause"),
     [
-        ("", "empty"),
-        ("landmarks: []", "no landmarks"),
-        ("- 1\n- 2", "expected keys"),
-        ("landmarks: [{id: 1", "not YAML"),
-        ("landmarks: !!python/object/apply:os.system [ls]", "expected a list|no landmarks|expected keys"),
-        ("landmarks: " + "[" * 5000 + "]" * 5000, "nested deeper"),
+        ("", None),
+        ("landmarks: []", None),
+        ("- 1\n- 2", None),
+        ("landmarks: [{id: 1", yaml.YAMLError),
+        ("landmarks: !!python/object/apply:os.system [ls]", None),
+        ("landmarks: " + "[" * 5000 + "]" * 5000, HostileError),
     ],
 )
-def test_what_is_no_map_is_refused(tmp_path: Path, text: str, match: str) -> None:
-    refused(tmp_path, text, match)
+def test_what_is_no_map_is_refused(tmp_path: Path, text: str, cause: type[Exception] | None) -> None:
+    path = written(tmp_path, text)
+    with refusal(MapError, path, cause=cause):
+        load_map(path)
 
 
 def test_fault_65_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
     levels = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     levels += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
     began = time.perf_counter()
-    refused(tmp_path, "\n".join(levels) + "\nlandmarks: *a11\n", "stand for more than")
+    bomb = written(tmp_path, "\n".join(levels) + "\nlandmarks: *a11\n")
+    with refusal(MapError, bomb, cause=HostileError):
+        load_map(bomb)
     assert time.perf_counter() - began < 1.0
 
 
 def test_missing_file_and_binary_file(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match=r"absent.yaml: cannot be read"):
+    with refusal(MapError, tmp_path / "absent.yaml", cause=FileNotFoundError):
         load_map(tmp_path / "absent.yaml")
     binary = tmp_path / "map.yaml"
     binary.write_bytes(b"\xff\xfe\x00\x01" * 10)
-    with pytest.raises(MapError, match="not a text file"):
+    with refusal(MapError, binary, cause=UnicodeDecodeError):
         load_map(binary)
 
 
 def test_ids_that_the_dictionary_lacks_are_noted(tmp_path: Path) -> None:
     [note] = load_map(written(tmp_path, OURS.replace("id: 7", "id: 70"))).notes
-    assert "below 50; [70] will never be seen" in note
+    assert re.search(r"\bDICT_4X4_50\b.*\b50\b.*\[70\]", note)
 
 
 def test_units_of_a_map_are_those_of_the_settings(tmp_path):

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from motion_models import make_card, make_tensors
+from refusal import refusal
+from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from fgloc.errors import ModelError
@@ -40,33 +42,33 @@ def write(path: Path, tensors: dict[str, np.ndarray], card: ModelCard, **changes
 def test_fault_34_wrong_input_size(card: ModelCard, rng: np.random.Generator, tmp_path: Path) -> None:
     tensors = make_tensors(card, rng)
     tensors["layer0.weight"] = tensors["layer0.weight"][:, :5].copy()
-    with pytest.raises(ModelError, match=r"layer0.weight has shape \(16, 5\).*needs \(16, 16\)"):
+    with refusal(ModelError, "layer0.weight", (16, 5), (16, 16)):
         load_model(write(tmp_path / "m.safetensors", tensors, card))
 
 
 def test_fault_34_wrong_normalization(card: ModelCard, rng: np.random.Generator, tmp_path: Path) -> None:
     tensors = make_tensors(card, rng)
     path = tmp_path / "m.safetensors"
-    with pytest.raises(ModelError, match=r"input_mean has 5 values.*need 16"):
+    with pytest.raises(ModelError, match=r"input_mean .*\b5\b.*\b16\b"):
         load_model(write(path, tensors, card, input_mean=[0.0] * 5))
-    with pytest.raises(ModelError, match=r"input_std.*[Ff]ield required"):
+    with pytest.raises(ModelError, match=r"\binput_std\b"):
         load_model(write(path, tensors, card, input_std=None))
-    with pytest.raises(ModelError, match=r"input_std.*greater than 0"):
+    with pytest.raises(ModelError, match=r"\binput_std\b.*\b0\b"):
         load_model(write(path, tensors, card, input_std=[0.0] * 16))
-    with pytest.raises(ModelError, match=r"output_scale has 2 values.*need 3"):
+    with pytest.raises(ModelError, match=r"output_scale .*\b2\b.*\b3\b"):
         load_model(write(path, tensors, card, output_scale=[1.0, 1.0]))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": "telepathy"}, r"kind.*'naive'.* or 'gru'.*'telepathy'"),
-        ({"version": 2}, r"2\), this program reads.* 1\)"),
+        ({"kind": "telepathy"}, r"kind.*'naive'.*'gru'.*'telepathy'"),
+        ({"version": 2}, r"'fgloc-motion', 2\).*'fgloc-motion', 1\)"),
         ({"format": "other"}, r"'other'.*'fgloc-motion'"),
         ({"inputs": ["commands", "lidar"]}, "lidar"),
-        ({"kind": "velocity"}, "needs the inputs"),
-        ({"hidden": [16, 8]}, r"layer1.weight has shape \(16, 16\).*needs \(8, 16\)"),
-        ({"hidden": [16]}, "holds the tensors"),
+        ({"kind": "velocity"}, r"\['commands', 'velocity'\].*\['velocity'\]"),
+        ({"hidden": [16, 8]}, r"layer1\.weight .*\(16, 16\).*\(8, 16\)"),
+        ({"hidden": [16]}, r"\['layer0\.bias', .*'layer2\..*\].*\['layer0\.bias', .*'layer1\."),
         ({"edges_s": [0.0, 0.2, 0.1]}, "increasing"),
         ({"surprise": 1}, "surprise"),
         ({"dt_s": float("nan")}, "dt_s"),
@@ -83,30 +85,29 @@ def test_fault_34_card_does_not_fit(
 def test_weights_must_be_finite_and_float32(card: ModelCard, rng: np.random.Generator, tmp_path: Path) -> None:
     tensors = make_tensors(card, rng)
     path = tmp_path / "m.safetensors"
-    with pytest.raises(ModelError, match="float64, expected float32"):
+    with pytest.raises(ModelError, match=r"layer1\.bias .*float64.*float32"):
         load_model(write(path, tensors | {"layer1.bias": np.zeros(16)}, card))
     tensors["layer1.bias"][3] = np.nan
-    with pytest.raises(ModelError, match=r"layer1.bias holds NaN"):
+    with pytest.raises(ModelError, match=r"layer1\.bias .*NaN"):
         load_model(write(path, tensors, card))
-    with pytest.raises(ModelError, match=r"layer1.bias holds NaN"):
+    with pytest.raises(ModelError, match=r"layer1\.bias .*NaN"):
         save_model(tmp_path / "n.safetensors", tensors, card)
     assert not list(tmp_path.glob("n.*"))
 
 
 def test_no_card_or_no_file(card: ModelCard, rng: np.random.Generator, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    with pytest.raises(ModelError, match=r"cannot be read|not a regular file"):
-        load_model(path)
-    with pytest.raises(ModelError, match="not a regular file"):
-        load_model(tmp_path)
+    for nothing in (path, tmp_path):
+        with refusal(ModelError, nothing):
+            load_model(nothing)
     save_file(make_tensors(card, rng), path)
-    with pytest.raises(ModelError, match="no card"):
+    with refusal(ModelError, path, "card"):
         load_model(path)
     save_file(make_tensors(card, rng), path, metadata={"card": "{"})
-    with pytest.raises(ModelError, match="not JSON"):
+    with refusal(ModelError, path, "card", cause=json.JSONDecodeError):
         load_model(path)
     save_file(make_tensors(card, rng), path, metadata={"card": "[1]"})
-    with pytest.raises(ModelError, match=r"format and version are \[1\]"):
+    with refusal(ModelError, path, "[1]", "'fgloc-motion', 1)"):
         load_model(path)
 
 
@@ -122,7 +123,7 @@ def test_fault_35_pickle_is_refused_unread(tmp_path: Path) -> None:
     victim = tmp_path / "made_by_the_pickle"
     path = tmp_path / "model.safetensors"
     path.write_bytes(pickle.dumps(_Malicious(victim)))
-    with pytest.raises(ModelError, match="pickles above all, are refused"):
+    with refusal(ModelError, path, cause=SafetensorError):
         load_model(path)
     assert not victim.exists()
     pickle.loads(path.read_bytes())  # it would have
