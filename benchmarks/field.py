@@ -31,6 +31,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -344,12 +345,12 @@ def _say(recording: Recording, o: Outcome) -> None:
 
 _HEAD = """# Recordings by others
 
-`python -m benchmarks.field --page docs/field.md` of {day}: `fgloc init BAG`, then `info`, `smooth` and `online` with the `robot.yaml` that `init` wrote and the
-set's map; nothing was fitted for a set. On the same messages: odometry alone, with its owner's geometry and aligned to the truth, and an iSAM2 with fixed constants
-("textbook", smoothed poses), which on a map begins at the truth's first pose ("alike": at fgloc's). The best tuned iSAM2 is in the [public bench](public.md).
+`python -m benchmarks.field --page docs/field.md` of {day}: `fgloc init BAG`, then `info`, `smooth` and `online` with the `robot.yaml` that it wrote and the
+set's map; nothing was fitted for a set. On the same messages: odometry alone, aligned to the truth, and an iSAM2 with fixed constants
+("textbook", smoothed), which on a map begins at the truth's first pose ("alike": at fgloc's). A tuned iSAM2 is in the [public bench](public.md).
 
-ATE is the rmse of positions [m]; where the truth's frame or the tracked body's place is not known, both are fitted for each estimator. NEES/3: batch / online, 1 is expected.
-Exit code: `smooth` / `online`. Choices were made with recordings marked *dev*; the others are only reported. Losses of batch against the best other first.
+ATE is the rmse of positions [m]; an unknown frame of the truth or place of the tracked body is fitted for each estimator. NEES/3 and exit code: batch / online.
+Choices were made with recordings marked *dev*. Losses of batch against the best other first.
 
 | recording | odometry | textbook | alike | batch | online | NEES/3 | exit |
 |---|---|---|---|---|---|---|---|
@@ -416,7 +417,7 @@ def _first(o: Outcome, mode: Mode) -> str:
     if not findings:
         return "–"
     text = str(findings[0]["text"]).replace("|", "\\|").replace("\n", " ").replace(f"{DATA}/", "")
-    return text if len(text) < 160 else f"{text[:157]}…"
+    return textwrap.shorten(text, 110, placeholder=" …")
 
 
 if __name__ == "__main__":
