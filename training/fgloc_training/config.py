@@ -93,7 +93,7 @@ class CalibrationConfig(Section):
     horizons_s: tuple[float, ...] = Field((5.0, 10.0), description="windows whose likelihood is maximized")
     short_s: tuple[float, ...] = Field((0.2, 1.0), description="windows that separate lasting from passing errors")
     memory_s: tuple[float, ...] = Field((0.2, 0.5, 1.0, 2.0), description="time constants tried for lasting errors")
-    window_s: float = Field(5.0, gt=0, description="windows of W, N and C")
+    window_s: float = Field(5.0, gt=0, description="windows of the covariances with the wheels")
 
 
 class AdaptationConfig(Section):
