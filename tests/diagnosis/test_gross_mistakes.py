@@ -148,7 +148,7 @@ def test_wrong_radius(looked, factor):
 
 def test_fault_52_mirrored_map(looked):
     found = looked.check(landmarks=mirrored(looked.landmarks)).correction
-    assert found.finding.text.startswith("The map is mirrored")
+    assert found.finding.code == "map.mirrored"
     for i, m in looked.landmarks.landmarks.items():
         np.testing.assert_allclose(found.landmark_map.landmarks[i].corners(), m.corners(), atol=1e-9)
 
@@ -157,7 +157,8 @@ def test_exchanged_ids(looked):
     seen = [m.landmark_id for row in looked.excerpt.pictures for p in row for m in p.seen]
     a, b = sorted(sorted(set(seen), key=seen.count)[-2:])
     found = looked.check(landmarks=swapped(looked.landmarks, a, b)).correction
-    assert f"exchange ids {a} and {b} in the map" in found.finding.text
+    assert found.finding.code == "map.ids"
+    assert re.search(rf"\bids {a} \w+ {b}\b", found.finding.text)
     np.testing.assert_array_equal(found.landmark_map.landmarks[a].position, looked.landmarks.landmarks[a].position)
 
 
@@ -229,7 +230,7 @@ def test_fault_52_map_shifted_against_the_given_first_pose():
     config = Config.model_validate({"estimator": {"initial_pose": [0.0, 0.0, 0.0]}})
     assert first_pose_sentence(config, np.array([0.2, -0.2, 0.1])) is None
     said = first_pose_sentence(config, np.array([2.0, -1.0, 0.0]))
-    assert "the map is shifted by 2.24 m" in said
+    assert "2.24 m" in said
     assert "estimator.initial_pose: [2.000, -1.000, 0.0000]" in said
     assert first_pose_sentence(Config(), np.array([2.0, -1.0, 0.0])) is None
 
@@ -282,7 +283,8 @@ def test_info_names_the_mistake_first(looked, tmp_path):
 def test_info_names_the_map_of_another_place(bag, of):
     arguments = ["--map", str(SAMPLES / of / "map.yaml"), "--config", str(SAMPLES / bag / "robot.yaml")]
     shown = CliRunner().invoke(cli.app, ["info", str(SAMPLES / bag / "bag"), *arguments])
-    assert f"What looks wrong:\n  - What the camera saw does not fit {SAMPLES / of / 'map.yaml'}" in shown.output
+    first = shown.output.partition("What looks wrong:\n")[2].splitlines()[0]
+    assert str(SAMPLES / of / "map.yaml") in first
     assert shown.exit_code == EXIT_LOST
 
 
@@ -293,5 +295,5 @@ def test_info_of_a_sound_set_up_ends_with_0_and_of_one_that_cannot_run_with_1(tm
     arguments = ["--map", str(SAMPLE / "map.yaml"), "--config", str(tmp_path / "robot.yaml")]
     unsettled = CliRunner().invoke(cli.app, ["info", str(SAMPLE / "bag"), *arguments])
     assert unsettled.exit_code == 1
-    assert "/odm is not in the recording" in unsettled.output
+    assert "/odm" in unsettled.output.partition("To be settled")[2].splitlines()[1]
     assert "nothing" not in unsettled.output

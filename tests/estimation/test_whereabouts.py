@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -57,12 +58,11 @@ def test_fault_52_a_map_shifted_as_a_whole_against_the_given_first_pose(kind):
     (told,) = [d for d in decisions if d.kind == "place"]
     assert told.reason == "contradicts initial_pose"
     assert told.weight == 0.0
-    assert math.hypot(*chain.localizer.tracking.initial_pose_conflict[:2]) == pytest.approx(
-        np.hypot(*SHIFT[:2]), abs=0.1
-    )
+    far = math.hypot(*chain.localizer.tracking.initial_pose_conflict[:2])
+    assert far == pytest.approx(np.hypot(*SHIFT[:2]), abs=0.1)
     (note,) = chain.localizer.notes  # of single markers that seem to be moved not a word
-    assert "the given first pose" in note
-    assert "correct estimator.initial_pose or the map" in note
+    assert "estimator.initial_pose" in note
+    assert f"{far:.2f} m" in note
 
 
 def test_fault_52_the_batch_does_not_snap_either():
@@ -93,8 +93,7 @@ def test_a_given_pose_that_is_right_is_confirmed_and_then_no_better_than_any_oth
     assert any(d.reason == "behind_camera" for d in e.decisions)  # what was refused is told beside it
     (leap,) = [i for i, far in enumerate(leaps(estimates)) if far > 0.3]
     assert estimates[leap + 1] is e
-    (note,) = [n for n in chain.localizer.notes if "jumped by" in n]
-    assert "sightings contradicted the estimated pose: jumped by 2.4" in note  # across the circle
+    assert [n for n in chain.localizer.notes if re.search(r"jumped\b.* 2\.4", n)]  # across the circle
     assert np.mean([position_error(e, world.truth(e.stamp_ns)) for e in estimates if seconds(e) > 10.5]) < 0.01
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -56,9 +57,9 @@ def test_a_robot_that_never_saw_a_landmark_is_lost_from_the_beginning():
     rows = [replace(row(k, "mode", "lost", nis=0.0, threshold=math.nan), residual=0.0) for k in range(300)]
     (j,) = judgements(run_of(*rows))
     assert (j.kind, j.from_s, j.to_s) == ("lost", 0.0, 29.9)
-    assert j.evidence == "no sighting was accepted before; 300 steps"
+    assert re.fullmatch(r"\D*\b300 steps", j.evidence)  # not since when: there was none
     later = [replace(r, residual=4.0 + 0.1 * r.step) for r in rows[200:]]
-    assert judgements(run_of(*later))[0].evidence.endswith(" s without an accepted sighting; 100 steps")
+    assert re.fullmatch(r"\d+\.\d s\b.*\b100 steps", judgements(run_of(*later))[0].evidence)
 
 
 def test_a_step_judged_again_counts_as_it_was_judged_last():
@@ -75,9 +76,10 @@ def test_rejections_of_a_landmark_that_is_found_moved_belong_to_that():
     assert set(found) == {"landmark_moved", "outlier"}
     assert found["landmark_moved"].what == "landmark 7 moved"
     assert (found["landmark_moved"].from_s, found["landmark_moved"].rows) == (1.0, 9)
-    assert found["outlier"].what == "single sightings rejected (landmark id 3)"
+    assert re.search(r"\bid 3\b", found["outlier"].what)
     several = judgements(run_of(other, row(10, "corners", "gate", landmark_id=9)))
-    assert [j.what for j in several] == ["single sightings rejected (landmark ids 3, 9)"]
+    assert [j.kind for j in several] == ["outlier"]
+    assert re.search(r"\bids 3, 9\b", several[0].what)
 
 
 def test_an_outage_says_how_far_the_robot_went_and_how_well_it_is_known():
@@ -86,7 +88,7 @@ def test_an_outage_says_how_far_the_robot_went_and_how_well_it_is_known():
     (j,) = judgements(replace(result, decisions=tuple(rows)))
     way = np.hypot(*np.diff(result.trajectory.poses[99:150, :2], axis=0).T).sum()
     assert j.kind == "outage"
-    assert j.effect.startswith(f"{way:.2f} m without a fix")
+    assert j.effect.startswith(f"{way:.2f} m ")
 
 
 def test_the_gravest_come_first_and_stray_outliers_not_at_all():
@@ -94,14 +96,12 @@ def test_the_gravest_come_first_and_stray_outliers_not_at_all():
     found = judgements(run_of(*slips(20, 30), *slips(60, 64), row(50, "corners", "gate", landmark_id=3), place))
     assert [j.kind for j in gravest(found, 3)] == ["relocated", "motion_faulty", "motion_faulty"]
     assert [j.rows for j in gravest(found, 3)][1:] == [10, 4]
-    assert "pose moved by 1.50 m" in gravest(found, 1)[0].effect
+    assert " 1.50 m" in gravest(found, 1)[0].effect
 
 
 def test_the_setups_mistakes_are_of_the_whole_run():
-    (j,) = judgements(
-        replace(run_of(), findings=(Finding("setup", "The markers are 0.16 m, not 0.2 m.", Severity.ERROR),))
-    )
-    assert (j.kind, j.when, j.evidence) == ("gross_mistake", "whole run", "The markers are 0.16 m, not 0.2 m.")
+    (j,) = judgements(replace(run_of(), findings=(Finding("setup", "Markers: 0.16 m, not 0.2 m.", Severity.ERROR),)))
+    assert (j.kind, j.when, j.evidence) == ("gross_mistake", "whole run", "Markers: 0.16 m, not 0.2 m.")
 
 
 @pytest.mark.parametrize("kind", ["jump", "overruled by sightings", "contradicts initial_pose"])

@@ -1,6 +1,7 @@
 """A live run: the same poses as a replay, poses between keyframes, threads, overload, sensors that join later."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -115,14 +116,14 @@ def test_an_estimation_process_that_ends_or_fails_is_told():
     with live_in(world, process=True) as live:
         feed(live, world.events())
         os.kill(live._estimation._child.pid, signal.SIGKILL)
-        with pytest.raises(EstimatorError, match="ended with exit code -9"):
+        with pytest.raises(EstimatorError, match=r"-9\b"):
             live.wait(PATIENCE_S)
-        with pytest.raises(EstimatorError, match="start again"):
+        with pytest.raises(EstimatorError, match=r"-9\b"):
             live.pose_at()
     settings = config(wheels={"source": "ticks", "left_radius": 0.05, "right_radius": 0.05, "track": 0.3})
     names = ("left_wheel", "left_wheel_rear")
     with Live(settings, beacons(), roles=("joints",), process=True) as live:
-        with pytest.raises(ConfigError, match="2 joints could be the left wheel"):
+        with pytest.raises(ConfigError, match=", ".join(names)):
             feed(live, [joints(1.0 + 0.02 * k, 0.0, 0.0, names=names) for k in range(200)])
         with pytest.raises(ConfigError):
             live.pose_at()
@@ -140,7 +141,8 @@ def test_fault_24_an_estimation_process_that_hangs_is_told(monkeypatch):
         os.kill(child, signal.SIGCONT)
         assert live.wait(PATIENCE_S)
         after = live.status()
-    assert "has not answered for 1 s: it hangs" in said.notes[0]
+    [hangs] = set(said.notes) - set(before.notes)
+    assert re.search(r"\b1 s\b", hangs)
     assert said.keyframes == before.keyframes
     assert after.notes == before.notes
 
@@ -274,7 +276,7 @@ def test_a_subscriber_that_fails_is_named_and_left_out():
         notes = live.status().notes
     assert len(called) == 1
     assert len(made) > 20
-    assert [n for n in notes if "a subscriber failed" in n and "ZeroDivisionError: of theirs" in n]
+    assert [n for n in notes if "ZeroDivisionError: of theirs" in n]
 
 
 def test_what_cannot_be_used_is_told_by_the_next_call():
@@ -282,7 +284,7 @@ def test_what_cannot_be_used_is_told_by_the_next_call():
     settings = config(wheels={"source": "ticks", "left_radius": 0.05, "right_radius": 0.05, "track": 0.3})
     live = Live(settings, beacons(), roles=("joints",))
     events = [joints(1.0 + 0.02 * k, 0.0, 0.0, names=names) for k in range(200)]
-    with pytest.raises(ConfigError, match="2 joints could be the left wheel"):
+    with pytest.raises(ConfigError, match=", ".join(names)):
         feed(live, events)
     with pytest.raises(ConfigError):
         live.pose_at()
@@ -362,7 +364,7 @@ def test_a_pose_that_is_told_is_taken_and_sightings_win_over_a_wrong_one():
 def test_a_pose_that_is_none_is_refused():
     with Live(config(), beacons()) as live:
         for pose, sigmas in (((0.0, 0.0), (1.0, 1.0, 1.0)), ((0.0, 0.0, np.nan), (1, 1, 1)), ((0, 0, 0), (1, 0, 1))):
-            with pytest.raises(EstimatorError, match="expected three finite values"):
+            with pytest.raises(EstimatorError, match=re.escape(f"{pose} with sigmas {sigmas}")):
                 live.reset_pose(pose, sigmas)
 
 
@@ -383,7 +385,7 @@ def test_events_may_be_told_in_plain_numbers():
         pose = live.pose_at()
         assert np.hypot(*(pose.pose - truth_at((pose.stamp_ns - START_NS) * 1e-9))[:2]) < 0.15
         assert set(live.status().topics) == {"odometry", "imu", "command", "sightings"}
-        with pytest.raises(RecordingError, match=r"image of shape \(4, 4\) and type float64"):
+        with pytest.raises(RecordingError, match=r"\(4, 4\).*\bfloat64\b"):
             live.image(1, np.zeros((4, 4)))
 
 
@@ -421,7 +423,7 @@ def test_the_status_says_how_the_topics_come_in():
     assert status.topics["/odom"].rate_hz == pytest.approx(20.0, rel=0.05)
     assert status.topics["/tags"].delay_s == pytest.approx(0.04, abs=0.005)
     assert status.topics["/tags"].role == "sightings"
-    assert "/cmd_vel: no message for 4 s" in status.notes
+    assert [n for n in status.notes if re.match(r"/cmd_vel: .*\b4 s$", n)]
     assert status.mode is Mode.OK
     assert status.running
     assert 0.0 < status.step_ms <= status.step_ms_max

@@ -103,7 +103,7 @@ def test_mcap_diagnostics_name_each_change_of_mode(tmp_path):
 
 def test_mcap_of_nothing_is_refused(tmp_path):
     empty = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    with pytest.raises(TrajectoryError, match="expected a run with poses"):
+    with pytest.raises(TrajectoryError, match=r"run\.mcap"):
         write_mcap(replace(figure_eight(), trajectory=empty), tmp_path / "run.mcap")
     assert not (tmp_path / "run.mcap").exists()
     (tmp_path / "file").write_text("")
@@ -146,11 +146,15 @@ def test_a_folder_is_read_back_as_it_was(tmp_path):
     ("file", "content", "named"),
     [
         ("trajectory.tum", None, "trajectory.tum"),
-        ("covariance.csv", "stamp,xx\n", "0 rows, expected"),
-        ("steps.csv", "step,stamp,kind\nx,1.0,wheels\n", "steps.csv, line 2: 'x'|not a number"),
-        ("steps.csv", "step,stamp,kind,landmark_id,residual,nis,dof,weight\n1,inf,wheels,1,1,1,1,1\n", "out of range"),
-        ("metrics.json", "[1]", "expected an object"),
-        ("config.json", "{", "not JSON"),
+        ("covariance.csv", "stamp,xx\n", r"covariance\.csv: 0 "),
+        ("steps.csv", "step,stamp,kind\nx,1.0,wheels\n", r"steps\.csv, line 2: "),
+        (
+            "steps.csv",
+            "step,stamp,kind,landmark_id,residual,nis,dof,weight\n1,inf,wheels,1,1,1,1,1\n",
+            r"steps\.csv, line 2: stamp inf\b",
+        ),
+        ("metrics.json", "[1]", r"metrics\.json: .*\blist\b"),
+        ("config.json", "{", r"config\.json: .*JSON"),
     ],
 )
 def test_a_damaged_folder_is_named(tmp_path, file, content, named):
@@ -188,7 +192,7 @@ def test_a_run_on_uneven_ground_is_read_back_in_space(tmp_path):
 
 
 def test_what_is_no_folder_of_a_run_is_named(tmp_path):
-    with pytest.raises(TrajectoryError, match=r"no trajectory\.tum in it; give the folder of a finished run"):
+    with pytest.raises(TrajectoryError, match=rf"{tmp_path}.* trajectory\.tum"):
         read_results(tmp_path)
 
 

@@ -91,7 +91,7 @@ def test_choices_by_name_are_told():
     assert "/odom" in note
     assert "/ekf" in note
     (note,) = select(("/somewhere", POSE)).notes
-    assert "/somewhere is taken as truth" in note
+    assert re.search(r"/somewhere\b.*\btruth\b", note)
     (note,) = select(("/amcl_pose", COVARIANCE)).notes
     assert "recording.topics.truth: /amcl_pose" in note
 
@@ -104,10 +104,10 @@ def test_topics_without_messages_are_no_candidates():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"odometry": "/absent"}, r"odometry: /absent is not in the recording; choose /odom or /ekf"),
-        ({"odometry": "/cmd"}, r"/cmd is a geometry_msgs/msg/Twist, expected nav_msgs/msg/Odometry"),
-        ({"odometry": "/void"}, r"/void has no messages"),
-        ({"odometry": "/odom", "truth": "/odom"}, r"/odom is given for another role too"),
+        ({"odometry": "/absent"}, r"odometry: /absent\b.*/odom\b.*/ekf\b"),
+        ({"odometry": "/cmd"}, r"odometry: /cmd\b.*geometry_msgs/msg/Twist\b.*nav_msgs/msg/Odometry"),
+        ({"odometry": "/void"}, r"odometry: /void\b.*/odom\b.*/ekf\b"),
+        ({"odometry": "/odom", "truth": "/odom"}, r"truth: /odom\b"),
     ],
 )
 def test_configured_topics_that_do_not_fit(given, message):
@@ -160,10 +160,8 @@ def test_markers_are_not_taken_twice_from_images_and_from_their_detections():
     found = select(*topics)
     assert found.roles == {"camera_info": "/camera/camera_info", "sightings": "/tags"}
     assert not found.problems
-    assert found.notes == (
-        "/camera/image_raw is not used as image, because /tags tells of the markers already "
-        "(to use both: name both in recording.topics; to use it alone: recording.topics.sightings: none).",
-    )
+    [note] = found.notes
+    assert re.search(r"^/camera/image_raw\b.* /tags\b.*recording\.topics\.sightings: none\b", note)
     assert "sightings" not in select(*topics, image="/camera/image_raw").roles
     assert select(*topics, sightings="none").roles["image"] == "/camera/image_raw"
     assert len(select(*topics, image="/camera/image_raw", sightings="/tags").roles) == 3

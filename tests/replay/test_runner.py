@@ -177,7 +177,7 @@ def test_fault_15_a_bag_whose_clock_is_set_back_still_gives_a_trajectory_in_orde
     bag = write_world(tmp_path, first, second)
     result = run(bag, tmp_path / "map.yaml", config(), mode)
     assert (np.diff(result.trajectory.stamps_ns) > 0).all()
-    assert any("he clock jumped back by" in note for note in result.notes)
+    assert any(re.search(r"\bclock\b.* 3\.\d s\b", note) for note in result.notes)
     late = result.trajectory.stamps_ns > START_NS + 4 * 10**9
     truth = [second.truth(int(s)) for s in result.trajectory.stamps_ns[late]]
     assert np.hypot(*(result.trajectory.poses[late] - np.array(truth))[:, :2].T).mean() < 0.05
@@ -242,5 +242,5 @@ def test_images_whose_markers_are_not_on_the_map_have_arrived(tmp_path):
     with pytest.raises(EstimatorError) as caught:
         run(sample / "bag", tmp_path / "map.yaml", config, "online", events=begun)
     said = str(caught.value)
-    assert re.search(r"None of the ids that were seen \(\d[\d, ]*\) is in the map, which has 40, 41", said)
-    assert "no usable message" not in said
+    assert re.search(r"\bids\b.* \(\d[\d, ]*\) .* 40, 41\b", said)
+    assert "(image)" not in said  # as of a topic that never spoke

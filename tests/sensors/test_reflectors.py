@@ -1,6 +1,7 @@
 """Reflectors without identity: hits of a scan, their names, the first pose by constellations, what a user is told."""
 
 import math
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +12,11 @@ from typer.testing import CliRunner
 from fgloc import Live, se2
 from fgloc.calibration.first_settings import first_settings
 from fgloc.cli import app
-from fgloc.config import GateConfig, config_of, config_of_file
+from fgloc.config import Config, GateConfig, config_of, config_of_file
 from fgloc.errors import ConfigError, EstimatorError
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.frames import yaw_quaternion
+from fgloc.recording.info import inspect
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.base import Context
@@ -139,7 +141,8 @@ def test_a_spot_across_the_first_beam_is_one_hit_and_a_wide_one_is_none():
     assert abs(m.bearing_rad) == pytest.approx(math.pi, abs=0.02)
     wall = dict.fromkeys(range(100, 120), 2.0)
     assert not list(sensor.measure(scan(wall, wall)))
-    assert [note for note in sensor.notes if "1 bright spots are wider" in note]
+    [note] = [note for note in sensor.notes if "reflectors.size_m" in note]
+    assert note.startswith("1 ")
 
 
 def test_hits_are_moved_to_the_base_and_have_the_time_of_their_beam():
@@ -246,7 +249,7 @@ def test_a_hit_that_two_beacons_explain_is_rejected(tmp_path):
 def test_a_symmetric_constellation_starts_nowhere(tmp_path):
     """A rectangle of reflectors looks the same from the other side."""
     rectangle = ((-6.0, -4.0), (6.0, -4.0), (6.0, 4.0), (-6.0, 4.0))
-    with pytest.raises(EstimatorError, match="first pose was never found"):
+    with pytest.raises(EstimatorError, match=r"estimator\.initial_pose"):
         localized(Drive(rectangle, seconds=8.0), tmp_path)
     result, metrics = localized(
         Drive(rectangle, seconds=8.0), tmp_path / "told", estimator={"initial_pose": [1.0, -2.0, 2.0]}
@@ -260,13 +263,14 @@ def test_another_place_of_the_same_kind_starts_nowhere(tmp_path):
     elsewhere = tuple((0.8 * y + 1.0, x - 2.0) for x, y in ROOM)
     bag = Drive(seconds=8.0).write(tmp_path)
     write_map(points(*elsewhere), tmp_path / "other.yaml")
-    with pytest.raises(EstimatorError, match="first pose was never found"):
+    with pytest.raises(EstimatorError, match=r"estimator\.initial_pose"):
         run(bag, tmp_path / "other.yaml", config_of(SETTINGS), "online")
 
 
 def test_a_wrong_first_pose_is_said(tmp_path):
     result, _ = localized(Drive(seconds=10.0), tmp_path, estimator={"initial_pose": [3.0, 1.0, 0.0]})
-    assert [f for f in result.findings if "contradict the given first pose" in f.text]
+    assert [d for d in result.decisions if d.reason == "contradicts initial_pose"]
+    assert [f for f in result.findings if "estimator.initial_pose" in f.text]
     assert not result.counts.get("reflectors")
 
 
@@ -290,15 +294,14 @@ def info(bag, config=None):
 def test_info_says_what_is_missing(tmp_path):
     bag = Drive(seconds=2.0).write(tmp_path)
     config = tmp_path / "robot.yaml"
-    assert "give reflectors.min_intensity in robot.yaml" in " ".join(info(bag).split())
-    config.write_text(yaml.safe_dump(SETTINGS))
-    told = " ".join(info(bag, config).split())
-    assert "is not used" not in told
-    assert "nothing bounds the drift" not in told
+    [unused] = [f.text for f in inspect(bag, Config()).found if f.code == "recording.unused"]
+    assert "reflectors.min_intensity" in unused
+    assert unused in info(bag)
+    assert not {f.code for f in inspect(bag, config_of(SETTINGS)).found} & {"recording.unused", "place.unbounded"}
     config.write_text("reflectors: {min_intensity: 5000}")
-    assert "the brightest has 900" in " ".join(info(bag, config).split())
+    assert re.search(r"/scan: .*\b900\b", info(bag, config))
     dark = Drive(seconds=2.0, intensities=False).write(tmp_path / "dark")
-    assert "10 of 10 scans have no intensities" in " ".join(info(dark, config).split())
+    assert re.search(r"/scan: 10 of 10\b", info(dark, config))
 
 
 @pytest.mark.parametrize(
