@@ -40,7 +40,8 @@ _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sou
 _WRONG_JUMP = 1e-2  # probability that a place to which the estimate jumps is wrong ...
 _BY_ACCIDENT = 0.1  # ... and that a sighting agrees with it nevertheless
 _LONG_AGO = 100
-_ELSEWHERE = np.square([10.0, 10.0, 1.8])  # m², m², rad²
+_SURE = 1.0 - 1e-12
+_ELSEWHERE = np.diag(np.square([10.0, 10.0, 1.8]))  # m², m², rad²
 _UNBOUNDED = np.full(3, np.inf)
 _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
 
@@ -53,7 +54,8 @@ class _Fault:
         name: of the cause.
         share: its probability.
         mean: ``(3,)`` of the error's size.
-        added: ``(3,)`` variance, beside that of the noise.
+        added: ``(4,)`` variance, beside that of the noise: along, across, of the yaw, and in the direction where the
+            place has most of it.
         most: ``(3,)`` that the fault alone can make.
     """
 
@@ -66,7 +68,14 @@ class _Fault:
     def beside(self, other: _Fault) -> _Fault:
         """Both at once, as probable as this one alone."""
         mean, added = self.mean + other.mean, self.added + other.added
-        return _Fault(self.name, self.share, mean, added, self.most + 10.0 * np.sqrt(other.added))
+        return _Fault(self.name, self.share, mean, added, self.most + 10.0 * np.sqrt(other.added[:3]))
+
+
+def _directions(cov: FloatArray) -> FloatArray:
+    """Variances ``(..., 4)`` along, across, of the yaw, and in the direction where the place has most of it."""
+    x, y = cov[..., 0, 0], cov[..., 1, 1]
+    most = 0.5 * (x + y) + np.hypot(0.5 * (x - y), cov[..., 0, 1])
+    return np.stack([x, y, cov[..., 2, 2], most], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,37 +102,37 @@ class Fix:
             off: ``(3,)`` variance that it adds to the prediction.
 
         Returns:
-            Probability after the sightings, mean ``(3,)`` and added variance ``(3,)`` of the error.
+            Probability after the sightings, mean ``(3,)`` and added covariance ``(3, 3)`` of the error.
         """
         P = joint_cov(self.predicted, self.known)
         found = innovation(P, self.lines)
         H = found.H[:, :3]
-        cross, variance = found.H @ P[:, :3], np.diag(P)[:3]
-        log_sound, sound, cov = _corrected(found.residual, found.cov, cross, variance)
+        cross, before = found.H @ P[:, :3], P[:3, :3]
+        log_sound, sound, cov = _corrected(found.residual, found.cov, cross, before)
         log_slipped, moved, wide = _corrected(
-            found.residual, found.cov + (H * off) @ H.T, cross + H * off, variance + off
+            found.residual, found.cov + (H * off) @ H.T, cross + H * off, before + np.diag(off)
         )
-        odds = math.log(max(prior, 1e-300)) - math.log1p(-min(prior, 0.5)) + log_slipped - log_sound
+        odds = math.log(max(prior, 1e-300)) - math.log1p(-min(prior, _SURE)) + log_slipped - log_sound
         share = 1.0 / (1.0 + math.exp(-float(np.clip(odds, -700.0, 700.0))))
-        return share, moved - sound, _OVERBOUND**2 * np.maximum(wide - cov, 0.0)
+        return share, moved - sound, _OVERBOUND**2 * (wide - cov)
 
 
 def _corrected(
-    residual: FloatArray, cov: FloatArray, cross: FloatArray, variance: FloatArray
+    residual: FloatArray, cov: FloatArray, cross: FloatArray, before: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Log-likelihood of an innovation, the correction ``(3,)`` of the pose, and the pose's variance ``(3,)`` after it.
+    """Log-likelihood of an innovation, the correction ``(3,)`` of the pose, and its covariance ``(3, 3)`` after it.
 
     Args:
         residual: ``(d,)``.
         cov: ``(d, d)`` of it.
         cross: ``(d, 3)`` covariance of it and the pose.
-        variance: ``(3,)`` of the pose before.
+        before: ``(3, 3)`` covariance of the pose before.
     """
     root = np.linalg.cholesky(cov)
     white = np.linalg.solve(root, np.column_stack([residual, cross]))
     w, gain = white[:, 0], white[:, 1:]
     fits = -0.5 * float(w @ w) - float(np.log(np.diag(root)).sum())
-    return fits, -gain.T @ w, variance - (gain**2).sum(axis=0)
+    return fits, -gain.T @ w, before - gain.T @ gain
 
 
 class ProtectionLevels:
@@ -137,6 +146,7 @@ class ProtectionLevels:
         self._fastest: FloatArray = np.zeros(2)  # speed and yaw rate since the last fix ...
         self._agreeing = _LONG_AGO  # sightings since the robot was found at another place
         self._blind_s = 0.0  # ... which was so long before the newest pose
+        self._slipped = 0.0  # probability that the wheels slipped just before the last fix
         self._risks = risk * np.array([1.0, 1.0, 1.0, 2.0])
         self._negligible = 1e-3 * risk  # probability of a fault
         within, around = -float(ndtri(0.5 * risk)), math.sqrt(-2.0 * math.log(2.0 * risk))
@@ -155,7 +165,7 @@ class ProtectionLevels:
         slips_per_s: float = 0.0,
         fix: Fix | None = None,
         as_seen: Iterable[tuple[str, FloatArray, FloatArray]] = (),
-        carried: tuple[float, FloatArray] = (0.0, np.zeros(3)),
+        carried: tuple[float, FloatArray] = (0.0, np.zeros((3, 3))),
     ) -> Protection:
         """Bound of the newest pose.
 
@@ -166,39 +176,38 @@ class ProtectionLevels:
             checked: whether wheels are compared with an independent source of motion.
             slips_per_s: slips that were found in this run: where wheels slip, some slips pass unseen.
             fix: how sightings were used, if they were.
-            as_seen: constants that are held against the sightings, with mean ``(3,)`` and variance ``(3,)`` of the
+            as_seen: constants that are held against the sightings, with mean ``(3,)`` and covariance ``(3, 3)`` of the
                 pose's difference if these are right.
-            carried: probability that the robot was carried away, and variance ``(3,)`` of the error then.
+            carried: probability that the robot was carried away, and covariance ``(3, 3)`` of the error then.
         """
-        variance = _OVERBOUND**2 * np.diag(cov)
-        widest = _OVERBOUND**2 * float(np.linalg.eigvalsh(cov[:2, :2])[-1])  # variance in the worst direction
+        slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
+        self._modes.mounts.weigh()  # what is left
         faults = [
-            _Fault(f"landmark {landmark_id}", share, np.abs(bias), spread)
+            _Fault(f"landmark {landmark_id}", share, np.abs(bias), _directions(spread))
             for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED)
             if share > self._negligible
         ]
         faults += [
-            _Fault(f"mounting of {sensor_name(kind)}", share, np.abs(bias), spread)
+            _Fault(f"mounting of {sensor_name(kind)}", share, np.abs(bias), _directions(spread))
             for kind, share, bias, spread in self._modes.mounts.displaced()
             if share > self._negligible
         ]
-        slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
         if slip is not None and slip.share > self._negligible:
             faults.append(slip)
         if carried[0] > self._negligible:
-            faults.append(_Fault("carried away", carried[0], np.zeros(3), carried[1]))
+            faults.append(_Fault("carried away", carried[0], np.zeros(3), _directions(carried[1])))
         self._agreeing += 0 if fix is None else len(fix.lines)
         if (share := _WRONG_JUMP * _BY_ACCIDENT**self._agreeing) > self._negligible:
-            faults.append(_Fault("place", share, np.zeros(3), _ELSEWHERE))
+            faults.append(_Fault("place", share, np.zeros(3), _directions(_ELSEWHERE)))
         if held := list(as_seen):  # beside each of the others, too
             off = _Fault(
                 " + ".join(name for name, *_ in held),
                 1.0,
                 np.sum([np.abs(mean) for _, mean, _ in held], axis=0),
-                _OVERBOUND**2 * np.sum([spread for *_, spread in held], axis=0),
+                _OVERBOUND**2 * _directions(np.sum([spread for *_, spread in held], axis=0)),
             )
             faults = [off, *faults, *(f.beside(off) for f in faults)]
-        sound = np.sqrt([*variance, widest])
+        sound = _OVERBOUND * np.sqrt(_directions(cov))
         bound, cause = self._least(sound, faults)
         return Protection(bound[:3], float(bound[3]), cause, self._is_alert(float(bound[3]), float(bound[2])))
 
@@ -222,10 +231,13 @@ class ProtectionLevels:
         expected = (_SLIP_PER_S + slips_per_s) * blind_s
         off = np.square(np.array([linear, linear, turn]) * min(blind_s, _SLIP_LASTS_S)) * (1.0 + expected)
         off *= _CHECKED**2 if checked else 1.0
-        share, bias, spread = -math.expm1(-expected), np.zeros(3), off
+        goes_on = self._slipped * math.exp(-blind_s / _SLIP_LASTS_S)  # a slip that has begun
+        share, bias, spread = goes_on - (1.0 - goes_on) * math.expm1(-expected), np.zeros(3), np.diag(off)
         if since_fix_s == 0.0 and fix is not None:
+            self._modes.mounts.weigh(share, off)
             share, bias, spread = fix.if_slipped(share, off)
-        return _Fault("slip", share, np.abs(bias), spread, blind_s * np.array([linear, linear, turn]))
+            self._slipped = share
+        return _Fault("slip", share, np.abs(bias), _directions(spread), blind_s * np.array([linear, linear, turn]))
 
     def _least(self, sound: FloatArray, faults: Sequence[_Fault]) -> tuple[FloatArray, str]:
         """Least bounds ``(4,)`` on x, y, yaw and distance that keep the risk, and what that on the distance is due to.
@@ -239,9 +251,9 @@ class ProtectionLevels:
             return low, "noise"
         share = np.array([1.0, *(fault.share for fault in faults)])
         mean, sigma, most = np.zeros((len(share), 4)), np.tile(sound, (len(share), 1)), np.zeros((len(share), 4))
-        for i, fault in enumerate(faults, 1):  # no direction is spread by more than the trace
+        for i, fault in enumerate(faults, 1):
             mean[i] = *fault.mean, math.hypot(fault.mean[0], fault.mean[1])
-            sigma[i] = np.sqrt(sound**2 + [*fault.added, fault.added[0] + fault.added[1]])
+            sigma[i] = np.sqrt(sound**2 + fault.added)
             most[i] = *fault.most, fault.most[0]
 
         def beyond(bound: FloatArray) -> FloatArray:

@@ -83,7 +83,8 @@ def rotation_cov(H: FloatArray, rows: tuple[int, int]) -> FloatArray:
 
 _KNOCKED = np.array([0.03, 0.03, 0.05])  # m, m, rad: sigma of a mounting's change, in the base's axes
 _WRONG_FROM_THE_START = 1e-4  # probability that a mounting is another one than it was measured to be ...
-_KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards
+_KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards ...
+_LEVEL = 0.5  # ... of a camera so many: the others tilt it, and what it sees of markers contradicts that
 _MOST_ONSETS = 8  # of one sensor
 
 
@@ -99,16 +100,17 @@ class _Onsets:
         last_ns: stamp of the sensor's last sightings.
     """
 
-    def __init__(self, states: int) -> None:
+    def __init__(self, states: int, unseen: float) -> None:
+        self._unseen = unseen  # share of the changes that the sensor's own sightings do not contradict
         self.M, self.moved = np.zeros((0, states, 3)), np.zeros((0, 3))
         self.information, self.evidence, self.prior = np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
         self.last_ns: int | None = None
 
     def begin(self, stamp_ns: int) -> None:
         """Add a hypothesis that begins now; the least probable of the others goes if there are too many."""
-        prior = _WRONG_FROM_THE_START
+        prior = self._unseen * _WRONG_FROM_THE_START
         if self.last_ns is not None:
-            prior = -math.expm1(-max(stamp_ns - self.last_ns, 0) * 1e-9 * _KNOCKS_PER_S)
+            prior = -self._unseen * math.expm1(-max(stamp_ns - self.last_ns, 0) * 1e-9 * _KNOCKS_PER_S)
         self.last_ns = stamp_ns
         if prior == 0.0:
             return
@@ -119,10 +121,47 @@ class _Onsets:
         self.information = np.concatenate([self.information, np.diag(_KNOCKED**-2.0)[None]])
         self.evidence, self.prior = np.append(self.evidence, 0.0), np.append(self.prior, prior)
 
+    def weigh(self, w: FloatArray, G: FloatArray, prior: float, wider: FloatArray) -> None:
+        """Add the evidence of white innovations, of which a slip of the wheels is another explanation.
+
+        Args:
+            w: ``(d,)``.
+            G: ``(k, d, 3)`` derivative of their mean by δ.
+            prior: probability that the wheels slipped.
+            wider: ``(d, d)`` Cholesky factor of their covariance then.
+        """
+        gap = w - (G @ self.moved[:, :, None])[:, :, 0]
+        cost, step, information = self._costs(gap, G)
+        sound = float(w @ w)
+        if prior > 0.0:
+            root, grown = np.linalg.inv(wider), 2.0 * float(np.log(np.diag(wider)).sum())
+            slip_cost, slip_step, slip_information = self._costs(gap @ root.T, root @ G)
+            slipped = slip_cost + grown - 2.0 * math.log(prior) < cost - 2.0 * math.log1p(-prior)
+            step = np.where(slipped[:, None], slip_step, step)
+            information = np.where(slipped[:, None, None], slip_information, information)
+            cost = _either(cost, slip_cost + grown, prior)
+            sound = float(_either(sound, float(np.square(root @ w).sum()) + grown, prior))
+        self.moved, self.information = self.moved + step, information
+        self.evidence = self.evidence + sound - cost
+
+    def _costs(self, gap: FloatArray, G: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Minus twice the log-likelihoods ``(k,)``, the corrections ``(k, 3)`` of δ, and the information after them."""
+        Gt = G.transpose(0, 2, 1)
+        pull, information = (Gt @ gap[:, :, None])[:, :, 0], self.information + Gt @ G
+        step = np.linalg.solve(information, pull[:, :, None])[:, :, 0]
+        grown = np.linalg.slogdet(information)[1] - np.linalg.slogdet(self.information)[1]
+        return (gap * gap).sum(1) - (pull * step).sum(1) + grown, step, information
+
     def _drop(self, k: int) -> None:
         kept = np.arange(len(self.prior)) != k
         self.M, self.moved, self.information = self.M[kept], self.moved[kept], self.information[kept]
         self.evidence, self.prior = self.evidence[kept], self.prior[kept]
+
+
+def _either(cost: FloatArray | float, other: FloatArray | float, prior: float) -> FloatArray:
+    """Minus twice the log-likelihood of a mixture, by those of its parts; ``prior`` is the share of the other one."""
+    sound, slipped = -0.5 * np.asarray(cost) + math.log1p(-prior), -0.5 * np.asarray(other) + math.log(prior)
+    return np.asarray(-2.0 * np.logaddexp(sound, slipped))
 
 
 class MountModes:
@@ -130,17 +169,20 @@ class MountModes:
 
     A sensor that was turned or pushed on the robot sees what it would see from another pose: δ enters its sightings as
     the pose does. All of them agree; only the way that the robot drives contradicts them. The change came before the
-    run, in a gap of the sightings or between any two of them: those onsets are followed that explain most.
+    run, in a gap of the sightings or between any two of them: those onsets are followed that explain most. Wheels that
+    slip drive another way, too: what a slip explains is no evidence.
     """
 
     def __init__(self, states: int) -> None:
         """Take the number of states beside δ, pose included."""
         self._states = states
         self._of: dict[str, _Onsets] = {}
+        self._taken: tuple[FloatArray, FloatArray, dict[str, FloatArray]] | None = None  # not weighed yet
 
     def reset(self) -> None:
         """Forget all evidence."""
         self._of.clear()
+        self._taken = None
 
     def move(self, A: FloatArray, D: FloatArray) -> None:
         """Follow a motion by its derivatives; see `transition`."""
@@ -150,7 +192,7 @@ class MountModes:
     def take(
         self, stamp_ns: int, H: FloatArray, W: FloatArray, w: FloatArray, gain: FloatArray, rows: Sequence[str]
     ) -> None:
-        """Add the evidence of the sightings of a keyframe.
+        """Follow the estimator through the sightings of a keyframe; `weigh` adds their evidence.
 
         Args:
             stamp_ns: of them.
@@ -160,24 +202,38 @@ class MountModes:
             gain: ``(3 + n, d)`` of the estimator on it.
             rows: sensor of each row; "" of what is of none.
         """
+        self.weigh()
         for name in dict.fromkeys(rows):
             if name:
-                self._of.setdefault(name, _Onsets(self._states)).begin(stamp_ns)
-        of = np.array(rows)
+                unseen = _LEVEL if name.endswith("corners") else 1.0
+                self._of.setdefault(name, _Onsets(self._states, unseen)).begin(stamp_ns)
+        of, by = np.array(rows), dict[str, FloatArray]()
         for name, one in self._of.items():
             G = -(H @ one.M)
             own = of == name
             G[:, own] -= H[own, :3]
             G = W @ G
-            Gt = G.transpose(0, 2, 1)
-            gap = w - (G @ one.moved[:, :, None])[:, :, 0]
-            before, pull = one.information, (Gt @ gap[:, :, None])[:, :, 0]
-            one.information = before + Gt @ G
-            step = np.linalg.solve(one.information, pull[:, :, None])[:, :, 0]
-            grown = np.linalg.slogdet(one.information)[1] - np.linalg.slogdet(before)[1]
-            one.moved = one.moved + step
-            one.evidence = one.evidence + float(w @ w) - (gap * gap).sum(1) + (pull * step).sum(1) - grown
+            by[name] = G
             one.M += gain @ G
+        self._taken = w, W @ H[:, :3], by
+
+    def weigh(self, prior: float = 0.0, off: FloatArray | None = None) -> None:
+        """Add the evidence of the sightings taken last, if that has not been done.
+
+        Args:
+            prior: probability that the wheels slipped before them.
+            off: ``(3,)`` variance of the pose that this adds, in the base's axes; None: they did not.
+        """
+        if self._taken is None:
+            return
+        w, by_pose, by = self._taken
+        self._taken = None
+        if off is None or prior <= 0.0:
+            prior, wider = 0.0, np.eye(len(w))
+        else:
+            prior, wider = min(prior, _SURE), np.linalg.cholesky(np.eye(len(w)) + (by_pose * off) @ by_pose.T)
+        for name, G in by.items():
+            self._of[name].weigh(w, G, prior, wider)
 
     def displaced(self) -> Iterator[tuple[str, float, FloatArray, FloatArray]]:
         """Each sensor and onset, the probability of it, and what it does to the pose; as `LandmarkModes.displaced`."""
@@ -185,7 +241,7 @@ class MountModes:
             M, spread = one.M[:, :3], np.linalg.inv(one.information)
             for k, prior in enumerate(one.prior.tolist()):
                 share = _share(prior, float(one.evidence[k]))
-                yield name, share, M[k] @ one.moved[k], np.diag(M[k] @ spread[k] @ M[k].T)
+                yield name, share, M[k] @ one.moved[k], M[k] @ spread[k] @ M[k].T
 
 
 _SURE = 1.0 - 1e-12
@@ -257,12 +313,12 @@ class LandmarkModes:
             prior: probability that a given landmark is displaced.
 
         Yields:
-            Its id, the probability that it is displaced, mean ``(3,)`` and variance ``(3,)`` of the error that this
+            Its id, the probability that it is displaced, mean ``(3,)`` and covariance ``(3, 3)`` of the error that this
             makes in the pose, in the base's axes.
         """
         evidence = self._evidence.sum(1)
         M = self._M[:, :3]
-        spread = np.einsum("lij,ljk,lik->li", M, self._cov, M)
+        spread = M @ self._cov @ M.transpose(0, 2, 1)
         bias = np.einsum("lij,lj->li", M, self._moved)
         for landmark_id, row in self._rows.items():
             if not self.excludes(landmark_id):

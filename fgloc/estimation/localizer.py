@@ -388,7 +388,7 @@ class Recorder:
             self._motion.slips_per_s,
             fix,
             self._estimator.if_as_seen(),
-            (carried, np.diag(around)),
+            (carried, around),
         )
         return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground, protection)
 

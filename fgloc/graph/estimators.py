@@ -213,7 +213,7 @@ class Estimator(ABC):
         """How the newest pose would differ if a held constant were what sightings made of it.
 
         Yields:
-            Name of the constant, difference ``(3,)`` in the base's axes, and its variance ``(3,)``.
+            Name of the constant, difference ``(3,)`` in the base's axes, and its covariance ``(3, 3)``.
         """
         known, cross = (None, None) if self.belief is None else (self.belief.installation, self.belief.cross)
         if known is None or cross is None:
@@ -221,7 +221,7 @@ class Estimator(ABC):
         prior, rows = self.installation.prior(), [self.installation.index[name] for name in self.contradicted]
         gains = np.linalg.solve(known.cov[np.ix_(rows, rows)], cross[:, rows].T) if rows else ()
         for (name, (value, sigma)), i, gain in zip(self.contradicted.items(), rows, gains, strict=True):
-            yield name, gain * (value - prior.mean[i]), np.square(gain * sigma)
+            yield name, gain * (value - prior.mean[i]), np.outer(gain, gain) * sigma**2
 
     def _hold_beyond_gate(self, belief: PoseWithCovariance) -> bool:
         """From now on hold what this belief has furthest beyond the gate of its prior; whether there was something.
