@@ -150,7 +150,7 @@ class _Onsets:
         pull, information = (Gt @ gap[:, :, None])[:, :, 0], self.information + Gt @ G
         step = np.linalg.solve(information, pull[:, :, None])[:, :, 0]
         grown = np.linalg.slogdet(information)[1] - np.linalg.slogdet(self.information)[1]
-        return (gap * gap).sum(1) - (pull * step).sum(1) + grown, step, information
+        return np.asarray((gap * gap).sum(1) - (pull * step).sum(1) + grown), step, information
 
     def _drop(self, k: int) -> None:
         kept = np.arange(len(self.prior)) != k
@@ -228,10 +228,11 @@ class MountModes:
             return
         w, by_pose, by = self._taken
         self._taken = None
+        wider: FloatArray = np.eye(len(w))
         if off is None or prior <= 0.0:
-            prior, wider = 0.0, np.eye(len(w))
+            prior = 0.0
         else:
-            prior, wider = min(prior, _SURE), np.linalg.cholesky(np.eye(len(w)) + (by_pose * off) @ by_pose.T)
+            prior, wider = min(prior, _SURE), np.linalg.cholesky(wider + (by_pose * off) @ by_pose.T)
         for name, G in by.items():
             self._of[name].weigh(w, G, prior, wider)
 
