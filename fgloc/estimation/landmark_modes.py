@@ -150,7 +150,8 @@ class _Onsets:
         pull, information = (Gt @ gap[:, :, None])[:, :, 0], self.information + Gt @ G
         step = np.linalg.solve(information, pull[:, :, None])[:, :, 0]
         grown = np.linalg.slogdet(information)[1] - np.linalg.slogdet(self.information)[1]
-        return np.asarray((gap * gap).sum(1) - (pull * step).sum(1) + grown), step, information
+        cost: FloatArray = (gap * gap).sum(1) - (pull * step).sum(1) + grown
+        return cost, np.asarray(step, dtype=np.float64), information
 
     def _drop(self, k: int) -> None:
         kept = np.arange(len(self.prior)) != k
@@ -232,7 +233,8 @@ class MountModes:
         if off is None or prior <= 0.0:
             prior = 0.0
         else:
-            prior, wider = min(prior, _SURE), np.linalg.cholesky(wider + (by_pose * off) @ by_pose.T)
+            prior = min(prior, _SURE)
+            wider = np.asarray(np.linalg.cholesky(wider + (by_pose * off) @ by_pose.T), dtype=np.float64)
         for name, G in by.items():
             self._of[name].weigh(w, G, prior, wider)
 
