@@ -349,11 +349,11 @@ _HEAD = """# Recordings by others
 set's map; nothing was fitted for a set. On the same messages: odometry alone, aligned to the truth, and an iSAM2 with fixed constants
 ("textbook", smoothed), which on a map begins at the truth's first pose ("alike": at fgloc's). A tuned iSAM2 is in the [public bench](public.md).
 
-ATE is the rmse of positions [m]; an unknown frame of the truth or place of the tracked body is fitted for each estimator. NEES/3 and exit code: batch / online.
+ATE is the rmse of positions [m]; an unknown frame of the truth or place of the tracked body is fitted for each estimator. NEES/3: batch / online.
 Choices were made with recordings marked *dev*. Losses of batch against the best other first.
 
-| recording | odometry | textbook | alike | batch | online | NEES/3 | exit |
-|---|---|---|---|---|---|---|---|
+| recording | odometry | textbook | alike | batch | online | NEES/3 |
+|---|---|---|---|---|---|---|
 """
 
 
@@ -362,10 +362,10 @@ def write_page(path: Path, chosen: Sequence[Recording], outcomes: Mapping[str, O
     lines = [_HEAD.format(day=datetime.now(UTC).date().isoformat()).rstrip("\n")]
     judged = [r for r in chosen if outcomes[r.name].ate]
     lines += [_line(r, outcomes[r.name]) for r in sorted(judged, key=lambda r: _order(outcomes[r.name]))]
-    rest = ", ".join(f"{r.name} ({_codes(outcomes[r.name])})" for r in chosen if r not in judged)
+    rest = ", ".join(r.name for r in chosen if r not in judged)
     lines += [
         "",
-        f"Without truth or poses (exit codes): {rest or 'none'}.",
+        f"Without truth or poses: {rest or 'none'}.",
         "",
         "## What a recording tells by itself",
         "",
@@ -381,10 +381,12 @@ def write_page(path: Path, chosen: Sequence[Recording], outcomes: Mapping[str, O
     ]
     for peculiar in dict.fromkeys(r.peculiar for r in chosen):
         lines.append(f"| {', '.join(r.name for r in chosen if r.peculiar == peculiar)} | {peculiar} |")
-    lines += ["", "First finding of a run that ended with exit code 3, or its error:", ""]
-    lines += ["| recording | named first |", "|---|---|"]
+    lines += ["", "Runs that ended with another exit code than 0 (`smooth` / `online`), and what they named first:", ""]
+    lines += ["| recording | exit | named first |", "|---|---|---|"]
+    failed = [r for r in chosen if any(outcomes[r.name].codes.get(mode) for mode in MODES)]
     lines += [
-        f"| {r.name} | {_first(outcomes[r.name], 'batch')} |" for r in chosen if outcomes[r.name].codes.get("batch")
+        f"| {r.name} | {_codes(outcomes[r.name])} | {_first(outcomes[r.name], _failed(outcomes[r.name]))} |"
+        for r in failed
     ]
     with atomic_file(path) as file:
         file.write("\n".join(lines) + "\n")
@@ -399,7 +401,12 @@ def _line(recording: Recording, o: Outcome) -> str:
     nees = " / ".join(_figure(nees_of(o, mode), 2) for mode in MODES)
     ates = [_figure(o.ate.get(key), 3) for key in ("odometry", "textbook.batch", "alike.batch", "batch", "online")]
     name = f"{recording.name} *dev*" if recording.development else recording.name
-    return f"| {name} | {' | '.join(ates)} | {nees} | {_codes(o)} |"
+    return f"| {name} | {' | '.join(ates)} | {nees} |"
+
+
+def _failed(o: Outcome) -> Mode:
+    """The mode whose exit code was not 0, the batch first."""
+    return next((mode for mode in MODES if o.codes.get(mode)), "batch")
 
 
 def _codes(o: Outcome) -> str:
