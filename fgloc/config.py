@@ -666,7 +666,10 @@ class TruthConfig(Section):
 
 
 class Config(SensorSections):
-    """All settings. ``robot.yaml`` holds the parts that differ from these defaults."""
+    """All settings.
+
+    ``robot.yaml`` holds the parts that differ from these defaults.
+    """
 
     recording: RecordingConfig = RecordingConfig()
     gate: GateConfig = GateConfig()
