@@ -102,13 +102,14 @@ class Budget:
             self.check(self.limit + 1)
 
 
-def decompressed(kind: str, data: bytes, limit: int) -> bytes:
+def decompressed(kind: str, data: bytes, limit: int, cut: bool = False) -> bytes:
     """Decompress all frames of some data.
 
     Args:
         kind: "zstd", "lz4", "bz2", or "" or "none" for data that is not compressed.
         data: compressed.
         limit: bytes that may come out.
+        cut: the data may end too early; what comes before is returned.
 
     Raises:
         OverflowError: more would come out.
@@ -133,6 +134,8 @@ def decompressed(kind: str, data: bytes, limit: int) -> bytes:
             if size > limit:
                 raise OverflowError(f"a chunk expands to more than {limit} bytes")
             if not part and not decompressor.eof:
+                if cut:
+                    return b"".join(parts)
                 raise ValueError(f"{kind} data ends too early")
         data = decompressor.unused_data or b""
     raise ValueError(f"more than {_FRAMES} frames in one chunk")

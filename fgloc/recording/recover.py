@@ -119,7 +119,7 @@ def _mcap_records(path: Path) -> Iterator[tuple[McapRecord | None, int]]:
 
 
 def _chunk_records(payload: bytes, complete: bool, budget: Budget) -> tuple[list[McapRecord | None], bool]:
-    """Records of a chunk, and whether it was sound. Of one that was cut short, the leading ones if not compressed."""
+    """Records of a chunk, and whether it was sound; the leading ones of a chunk that was cut short."""
     try:
         chunk = Chunk.read(ReadDataStream(BytesIO(payload)))
     except Exception:  # damaged bytes make the parser raise anything
@@ -128,19 +128,17 @@ def _chunk_records(payload: bytes, complete: bool, budget: Budget) -> tuple[list
         budget.check(chunk.uncompressed_size)
         budget.spend(chunk.uncompressed_size)
     try:
+        data = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size, cut=not complete)
         if complete:
-            data = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
             plain = replace(chunk, compression="", data=data)
             return list(breakup_chunk(plain, validate_crc=True)), True
-        if chunk.compression:
-            return [], False
     except Exception:  # damaged bytes make the parser raise anything
         return [], False
     records: list[McapRecord | None] = []
-    stream = BytesIO(chunk.data)
+    stream = BytesIO(data)
     while len(frame := stream.read(9)) == 9:
         opcode, length = struct.unpack("<BQ", frame)
-        inner = stream.read(min(length, len(chunk.data)))
+        inner = stream.read(min(length, len(data)))
         if len(inner) < length:
             break
         records.append(_mcap_record(opcode, inner))

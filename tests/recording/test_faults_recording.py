@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType, Writer
 from recording_bags import START_NS, TICK_NS, storage_file, write_drive, write_ros1
 from rosbags.rosbag2 import Reader
 
 from fgloc.config import RecordingConfig
 from fgloc.errors import RecordingError
 from fgloc.recording.reader import open_recording
+from fgloc.recording.recover import recover_mcap
 from fgloc.sensors.wheels.events import OdometryEvent
 
 DEFAULT = RecordingConfig()
@@ -40,7 +42,6 @@ def lost_share(note: str) -> float:
 def small_chunks(path: Path, chunk_bytes: int = 8192) -> Path:
     """Rewrite an MCAP with small zstd chunks, as recorders with little memory do."""
     from mcap.reader import make_reader
-    from mcap.writer import Writer
 
     target = path.with_name("chunked.mcap")
     with path.open("rb") as source, target.open("wb") as sink:
@@ -65,10 +66,24 @@ def cut(path: Path, share: float) -> Path:
 # --- 60: bag truncated ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("compressed", [False, True])
-def test_fault_60_truncated_mcap_is_salvaged(tmp_path, compressed):
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_fault_60_a_compressed_chunk_that_is_cut_short_gives_its_beginning(tmp_path, compression):
+    path, rng = tmp_path / "one_chunk.mcap", np.random.default_rng(0)
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=8 << 20, compression=compression)
+        writer.start(profile="ros2")
+        channel = writer.register_channel("/a", "cdr", writer.register_schema("x/msg/Y", "ros2msg", b"int32 a"))
+        for k in range(2000):
+            writer.add_message(channel, k, rng.bytes(300), k)
+        writer.finish()
+    found, _ = recover_mcap(cut(path, 0.5), tmp_path / "salvaged.mcap")
+    assert 500 < found < 1200
+
+
+@pytest.mark.parametrize("chunk_bytes", [None, 8192])
+def test_fault_60_truncated_mcap_is_salvaged(tmp_path, chunk_bytes):
     path = storage_file(write_drive(tmp_path / "run"))
-    path = cut(small_chunks(path) if compressed else path, 0.6)
+    path = cut(path if chunk_bytes is None else small_chunks(path, chunk_bytes), 0.6)
     received, notes = odometry_stamps(path)
     assert received == [START_NS + k * TICK_NS + 2_000_000 for k in range(len(received))]
     assert 0.4 * 200 < len(received) < 0.8 * 200
