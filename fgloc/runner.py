@@ -257,7 +257,8 @@ def _late(replay: Replay, estimates: Sequence[Estimate]) -> Iterator[Finding]:
         yield Finding(
             "place.late",
             f"The robot's place was known only after {at_s:.0f} of {whole_s:.0f} s, although it was searched from the "
-            "beginning: see which landmarks were seen until then, or give estimator.initial_pose.",
+            "beginning: see which landmarks, ranges or positions there were until then, or give "
+            "estimator.initial_pose.",
             Severity.WARNING,
             value=at_s,
         )

@@ -120,7 +120,8 @@ def _named(path: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         kept = f"; the old {what} is kept" if os.path.lexists(path) else ""
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}){kept}") from error
+        remedy = "make room on the disk" if error.errno == errno.ENOSPC else "give another place"
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}){kept}; {remedy}") from error
     except ValueError as error:
         if "\0" not in str(path):
             raise

@@ -320,7 +320,18 @@ def read_document(
     try:
         node = parse(text, str(path))
     except yaml.YAMLError as cause:
-        raise error(f"{path}: not YAML or JSON: {cause}") from cause
+        indented = _indented_by_tab(text, cause)
+        hint = f"line {indented} is indented by a tab; YAML takes spaces only" if indented else str(cause)
+        raise error(f"{path}: not YAML or JSON: {hint}") from cause
     if node is None:
         raise error(f"{path}: the file is empty")
     return Item(node, path, error)
+
+
+def _indented_by_tab(text: str, cause: yaml.YAMLError) -> int | None:
+    """Number of the line whose tab the reader stumbled over; None if it was something else."""
+    mark = cause.problem_mark if isinstance(cause, yaml.MarkedYAMLError) else None
+    lines = text.splitlines()
+    if mark is None or mark.line >= len(lines) or "\t" not in lines[mark.line][: mark.column + 1]:
+        return None
+    return int(mark.line) + 1

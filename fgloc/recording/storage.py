@@ -94,6 +94,11 @@ def _inside(path: Path, name: Any) -> str:
 # --- Which files belong to a recording --------------------------------------------------------------------------------
 
 _KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
+_MAGIC = {
+    b"#ROSBAG V2.0": (".bag", "a ROS 1 bag"),
+    b"\x89MCAP0\r\n": (".mcap", "an MCAP"),
+    b"SQLite format 3\0": (".db3", "SQLite"),
+}
 _MOST_NAMED = 5
 _WHOLE = 0.005  # share of a file's bytes: where so few are lost, it was cut off, or only its index is damaged
 _CUT = "; if it was cut off, what came after is missing"
@@ -163,8 +168,24 @@ def kind_of(path: Path) -> str:
     """
     suffix = path.suffix if path.suffix != ".zstd" else path.with_suffix("").suffix
     if suffix not in _KINDS:
-        raise RecordingError(f"{path}: unknown kind {suffix!r}; {EXPECTED} (fgloc convert reads some public data sets)")
+        raise RecordingError(f"{path}: unknown kind {suffix!r}; {_other_name(path) or _CONVERTED}")
     return _KINDS[suffix]
+
+
+_CONVERTED = f"{EXPECTED} (fgloc convert reads some public data sets)"
+
+
+def _other_name(path: Path) -> str:
+    """Advice where the content is of another kind than the name says; "" where it is of none that is known."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError:
+        return ""
+    for magic, (suffix, what) in _MAGIC.items():
+        if head.startswith(magic) and _KINDS.get(path.suffix) != _KINDS[suffix]:
+            return f"its content is {what}: rename it to {path.with_suffix(suffix).name}"
+    return "" if head else "it is empty: the recorder wrote nothing, or its copy failed"
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -373,6 +394,8 @@ class _File:
         if isinstance(error, TooLargeError):
             raise error
         reason = _reason(error)
+        if not self._recovered and (other := _other_name(self._path)):
+            raise RecordingError(f"{self._path}: cannot be read; {other}.") from error
         if self._recovered or isinstance(error, (PermissionError, FileNotFoundError)):
             raise RecordingError(f"{self._path}: cannot be read: {reason}.") from error
         try:
@@ -426,5 +449,4 @@ def _checked(reader: Any, kind: str, budget: Budget) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    text = str(error).strip().rstrip(".")
-    return text if isinstance(error, RecordingError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
+    return str(error).strip().rstrip(".") or type(error).__name__

@@ -208,3 +208,8 @@ def test_dictionary_file_that_never_ends_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.yml")
     with refusal(ConfigError, tmp_path / "pipe.yml"):
         load_dictionary(str(tmp_path / "pipe.yml"))
+
+
+def test_a_line_that_is_indented_by_a_tab_is_named(write):
+    with pytest.raises(ConfigError, match=r"robot\.yaml.*line 3 .*\btab\b"):
+        load_config(write("wheels:\n  scale_v: 1.0\n\tscale_w: 1.0\n"))

@@ -341,3 +341,17 @@ def test_fault_66_no_transforms_at_all(tmp_path):
         pytest.raises(RecordingError, match="the recording has no transforms"),
     ):
         recording.frames.lookup("base_link", "camera")
+
+
+@pytest.mark.parametrize(("name", "right"), [("run.mcap", "run.bag"), ("run", "run.bag"), ("run.db3", "run.bag")])
+def test_a_file_whose_content_is_of_another_kind_than_its_name_says_which(tmp_path, name, right):
+    path = write_ros1(tmp_path / "source.bag").rename(tmp_path / name)
+    with pytest.raises(RecordingError, match=rf"{re.escape(name)}.*ROS 1.* {right}"):
+        open_recording(path, DEFAULT)
+
+
+def test_an_empty_file_is_said_to_be_empty(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.touch()
+    with pytest.raises(RecordingError, match=r"run\.mcap.*empty"):
+        open_recording(path, DEFAULT)
