@@ -127,7 +127,7 @@ def test_unknown_keys_and_empty_intervals_are_refused():
         make("dropout", sensor="camera", duration=3)
     with pytest.raises(ValidationError, match="is empty"):
         make("dropout", sensor="camera", when={"intervals": [(4.0, 2.0)]})
-    with pytest.raises(ValidationError, match="lasts the whole run"):
+    with pytest.raises(ValidationError, match=r"\btruncated\b.*'when'"):
         make("truncated", when={"share": 0.5})
 
 
@@ -441,7 +441,7 @@ def test_a_topic_that_begins_after_the_kidnap_is_only_shifted():
 
 def test_kidnap_needs_bounds_and_takes_all():
     for when in ({"after_s": 1.0}, {"intervals": [(1.0, 2.0)], "share": 0.5}):
-        with pytest.raises(ValidationError, match="kidnap cuts whole pieces out"):
+        with pytest.raises(ValidationError, match=r"\bkidnap\b.*'when'"):
             make("kidnap", when=when)
 
 

@@ -33,7 +33,7 @@ def test_other_values_have_other_hashes(one, other):
 
 
 def test_a_value_without_a_hash_is_refused():
-    with pytest.raises(TypeError, match="set has no hash"):
+    with pytest.raises(TypeError, match=r"\bset\b"):
         digest({1})
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusal import refusal
 from typer.testing import CliRunner
 
 from fgloc import cli, se2
@@ -122,7 +123,7 @@ def test_sigmas_are_honest_and_shrink_with_every_recording(wheeled):
 
 
 def test_recordings_with_different_wheels_are_refused(commanded, wheeled):
-    with pytest.raises(EstimatorError, match="some of the recordings have wheels"):
+    with pytest.raises(EstimatorError, match=r"wheels\.source"):
         calibrate([commanded, wheeled[0]], commanded.parent / "map.yaml", settings("auto"))
 
 
@@ -138,7 +139,7 @@ def test_a_run_without_sightings_tells_no_gains(commanded):
         "estimator": {"initial_pose": [0.0, 0.0, 0.0]},
     }
     config = Config.model_validate(settings("command").model_dump(exclude_unset=True) | deaf)
-    with pytest.raises(EstimatorError, match="no sighting of a landmark was used"):
+    with refusal(EstimatorError, commanded):
         calibrate([commanded], commanded.parent / "map.yaml", config)
 
 

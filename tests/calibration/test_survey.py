@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
+from refusal import refusal
 from robot_world import SIGMA_PX, World, config, room, standing, truth_at
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -109,7 +111,7 @@ def test_bags_that_share_no_marker_are_refused(tmp_path):
         write_world(tmp_path / str(n), World(part(ids), seconds=12.0))
         for n, ids in enumerate((range(5), range(10, 15)))
     ]
-    with pytest.raises(RecordingError, match="no marker in common with the recordings before it"):
+    with pytest.raises(RecordingError, match=r"\[10, 11, 12, 13, 14\].*\[0, 1, 2, 3, 4\]"):
         survey(bags, settings())
 
 
@@ -149,11 +151,11 @@ def test_a_distance_that_does_not_fit_is_told(tmp_path):
     first, second = min(known), max(known)
     true = float(np.linalg.norm(known[first].position - known[second].position))
     made = survey([bag], settings(), distances=[Distance(first, second, 1.1 * true)])
-    assert any("the markers' size" in note for note in made.notes)
+    assert any(re.search(r"markers' size\b", note) for note in made.notes)
 
 
 def test_a_distance_to_a_marker_that_was_not_seen_is_refused(bag):
-    with pytest.raises(MapError, match="marker 77, to which a distance was measured, was not seen"):
+    with pytest.raises(MapError, match=r"\b77\b"):
         survey([bag], settings(), distances=[Distance(2, 77, 3.0)])
 
 
@@ -171,7 +173,7 @@ def test_markers_seen_too_seldom_are_left_out_with_the_reason(tmp_path):
             return dataclasses.replace(event, sightings=tuple(unique.values()))
 
     made = survey([write_world(tmp_path, Rare(room(), seed=3, seconds=22.0, rate=5))], settings())
-    assert made.left_out[33] == "seen 2 times, needed are 3"
+    assert re.search(r"\b2\b.*\b3\b", made.left_out[33])  # times seen, and needed
     assert len(made.landmarks) >= 18
     off, _ = errors(made.landmarks)
     assert np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 0.04
@@ -179,7 +181,7 @@ def test_markers_seen_too_seldom_are_left_out_with_the_reason(tmp_path):
 
 def test_what_is_missing_is_said(bag, tmp_path):
     blind = write_world(tmp_path / "blind", World(room(), seconds=4.0), sightings=False)
-    with pytest.raises(RecordingError, match="no images and no corners"):
+    with refusal(RecordingError, blind):
         survey([blind], settings())
     with pytest.raises(ConfigError, match="--size"):
         survey([bag], settings(markers={"default_size_m": None}))
@@ -197,7 +199,7 @@ def test_a_distance_that_is_none_is_refused(bag, tmp_path, text):
         app, ["map", str(bag), "--size", "0.25", "--distance", text, "--out", str(tmp_path / "m.yaml")]
     )
     assert done.exit_code == 1
-    assert "expected two ids and metres" in done.output
+    assert f"--distance {text}" in done.output
 
 
 def test_anchors_need_markers(tmp_path):
@@ -206,7 +208,7 @@ def test_anchors_need_markers(tmp_path):
     bag = write_world(tmp_path, World(beacons(), seconds=3.0))
     done = CliRunner().invoke(app, ["map", str(bag), "--distance", "1,2,3", "--out", str(tmp_path / "m.yaml")])
     assert done.exit_code == 1
-    assert "only one recording" in done.output
+    assert "--distance" in done.output
 
 
 def test_frames_are_aligned_though_some_markers_were_moved():

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from refusal import refusal
 
 from fgloc import se2
 from fgloc.calibrate import calibrate
@@ -83,15 +84,16 @@ def test_geometry_that_is_far_off_is_found_with_the_place_of_the_body(tmp_path):
 def test_wheels_that_do_not_follow_the_truth_are_named(tmp_path):
     exchanged = {"kind": "ackermann", "wheels": ["steering"], "steering_joints": ["traction"], "wheelbase": 1.2}
     bag = write_tricycle(tmp_path)
-    with pytest.raises(EstimatorError, match=r"do not follow the truth.*kind of drive"):
+    with pytest.raises(EstimatorError, match=r"\b4 s\b.*wheels\.drive"):
         calibrate([bag], None, settings(exchanged))
 
 
 def test_a_truth_of_a_few_seconds_determines_nothing(tmp_path):
-    with pytest.raises(EstimatorError, match="windows of 4 s"):
+    with pytest.raises(EstimatorError, match=r"\b4 s\b"):
         calibrate([write_tricycle(tmp_path, seconds=20.0)], None, settings(GUESS))
 
 
 def test_without_truth_and_landmarks_the_error_says_so(tmp_path):
-    with pytest.raises(EstimatorError, match="no sighting of a landmark"):
-        calibrate([write_tricycle(tmp_path, seconds=20.0, truth=False)], None, settings(GUESS))
+    bag = write_tricycle(tmp_path, seconds=20.0, truth=False)
+    with refusal(EstimatorError, bag):
+        calibrate([bag], None, settings(GUESS))

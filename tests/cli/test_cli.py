@@ -168,10 +168,10 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_run(bag, tmp_path)
     (tmp_path / "file").write_text("")
     code, _, said = fgloc("smooth", bag, "--out", tmp_path / "file")
     assert code == 2
-    assert "is a file" in said
+    assert "'--out'" in said
     code, _, said = fgloc("calibrate", bag, "--out", tmp_path)
     assert code == 2
-    assert "is a directory" in said
+    assert "'--out'" in said
 
 
 def test_real_time_replay_takes_the_recordings_time(tmp_path):
@@ -199,7 +199,7 @@ def test_map_surveys_the_beacons(bag, tmp_path):
 
 
 def test_info_with_a_map_that_is_not_there_is_an_error(bag, tmp_path):
-    assert "there is no such file" in refused("info", bag, "--map", tmp_path / "map.yaml")
+    assert str(tmp_path / "map.yaml") in refused("info", bag, "--map", tmp_path / "map.yaml")
 
 
 def test_info_names_what_would_be_used(bag):
@@ -227,7 +227,7 @@ def test_evaluate_prints_the_errors(tmp_path):
 def test_evaluate_refuses_what_cannot_be_compared(bag, tmp_path):
     (tmp_path / "a.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
     (tmp_path / "b.tum").write_text("5.0 0 0 0 0 0 0 1\n6.0 0 0 0 0 0 0 1\n")
-    assert "check the clocks" in refused("evaluate", tmp_path / "a.tum", tmp_path / "b.tum")
+    assert "0 of 2 poses" in refused("evaluate", tmp_path / "a.tum", tmp_path / "b.tum")
     (tmp_path / "b.tum").write_text("1.0 0 nan 0 0 0 0 1\n")
     assert "line 1: 'nan'" in refused("evaluate", tmp_path / "a.tum", tmp_path / "b.tum")
 

@@ -100,11 +100,11 @@ def test_waypoints_at_any_distance_make_a_curve() -> None:
 
 
 def test_wrong_paths_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"path 'grid' is not known; there are eight, grid20, grid30"):
+    with pytest.raises(ConfigError, match=r"'grid'.* eight, grid20, grid30"):
         load_path("grid")
     file = tmp_path / "twice.yaml"
     file.write_text("{name: twice, waypoints: [[0, 0], [0, 0], [1, 0]]}", encoding="utf-8")
-    with pytest.raises(ConfigError, match="waypoints 0 and 1 are both at"):
+    with pytest.raises(ConfigError, match=r"\b0 and 1\b.*\(0\.0, 0\.0\)"):
         load_path(str(file))
 
 
@@ -315,7 +315,7 @@ def test_other_poses_guide_the_robot_too(pose: str, tmp_path: Path) -> None:
 
 
 def test_fgloc_cannot_guide_a_robot_without_camera() -> None:
-    with pytest.raises(ConfigError, match="scenario 'room' shows the robot no markers"):
+    with pytest.raises(ConfigError, match=r"'room'.* fgloc"):
         follow(Drive(ROOM.model_copy(update={"camera": None}), HOOK, "fgloc"))
 
 

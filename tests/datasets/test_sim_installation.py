@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusal import refusal
 from rosbags.highlevel import AnyReader
 from sim_bags import messages
 
@@ -236,7 +237,7 @@ def test_installations_are_named_or_given_in_yaml(tmp_path: Path) -> None:
         path.write_text(f"name: a\ninstallation: {text}\n", encoding="utf-8")
         assert load_suite(path).entries[0].scenario.installation == expected
     path.write_text("name: a\ninstallation: sloppy\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match="'sloppy' is not known; expected as_installed or perfect"):
+    with pytest.raises(ConfigError, match=r"'sloppy'.*\bas_installed\b.*\bperfect\b"):
         load_suite(path)
 
 
@@ -249,7 +250,7 @@ def test_the_suite_is_as_installed_and_can_be_perfect() -> None:
 
 def test_a_truth_that_is_none_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "installed.yaml"
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with refusal(ConfigError, path, cause=FileNotFoundError):
         load_installed(path)
     write_installed(drawn(1), path)
     assert load_installed(path) == drawn(1)

@@ -1,6 +1,7 @@
 """Drives: the twist of known motions, derivatives by every parameter, and geometry that cannot be."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -133,15 +134,15 @@ def test_steering_ticks_count_up_to_half_a_turn():
 @pytest.mark.parametrize(
     ("name", "changes", "named"),
     [
-        ("omni", {"angles_deg": [0, 180, 0]}, "do not determine"),
+        ("omni", {"angles_deg": [0, 180, 0]}, r"\bomni\b.*docs/drives\.md"),
         ("omni", {"wheels": ["a"], "angles_deg": [0]}, "at least 3"),
-        ("omni", {"wheels": ["a", "b", "c", "d"]}, "wheels has 4 entries and angles_deg 3"),
-        ("mecanum", {"wheels": ["fl", "fr", "rl", "fl"]}, "named twice"),
+        ("omni", {"wheels": ["a", "b", "c", "d"]}, r"wheels\b.*\b4\b.*angles_deg\b.*\b3\b"),
+        ("mecanum", {"wheels": ["fl", "fr", "rl", "fl"]}, "fl, fr, rl, fl"),
         ("mecanum", {"radius": 0.0}, "greater than"),
         ("mecanum", {"wheelbase": 0.3}, "unknown key"),
-        ("ackermann", {"wheel_y": [0.7]}, "wheels has 2 entries and wheel_y 1"),
-        ("swerve", {"places": [[0, 0], [0, 0], [0, 0], [0, 0]]}, "do not determine"),
-        ("tricycle", {"sigmas": {"track": 0.1}}, "a tricycle has no track"),
+        ("ackermann", {"wheel_y": [0.7]}, r"wheels\b.*\b2\b.*wheel_y\b.*\b1\b"),
+        ("swerve", {"places": [[0, 0], [0, 0], [0, 0], [0, 0]]}, r"\bswerve\b.*docs/drives\.md"),
+        ("tricycle", {"sigmas": {"track": 0.1}}, r"\btricycle\b.*\btrack\b"),
     ],
 )
 def test_impossible_geometry_is_named_with_its_line(tmp_path, name, changes, named):
@@ -149,7 +150,7 @@ def test_impossible_geometry_is_named_with_its_line(tmp_path, name, changes, nam
     path.write_text(yaml.safe_dump({"wheels": {"drive": {**DRIVES[name], **changes}}}, default_flow_style=None))
     with pytest.raises(ConfigError, match=r"robot\.yaml:\d+: wheels\.drive") as error:
         load_config(path)
-    assert named in str(error.value)
+    assert re.search(named, str(error.value))
 
 
 def test_a_drive_of_no_kind_is_named_with_the_likeliest_one():

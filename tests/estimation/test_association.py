@@ -52,7 +52,7 @@ def accepted(rows: list[Decision]) -> list[int]:
     return sorted(d.landmark_id for d in rows if not d.reason)
 
 
-@pytest.mark.parametrize("beside", [True, False], ids=["beside one that fits", "alone"])
+@pytest.mark.parametrize("beside", [True, False], ids=["beside", "alone"])
 def test_a_misread_marker_is_known_by_its_place_only_beside_another(beside):
     """A robot that was carried on by the spacing of equal markers must not take each of them for the next one."""
     (rows,) = judged(ROW, image(ROW, (1, 4), (2, 2)) if beside else image(ROW, (1, 2), (2, 3)))

@@ -127,7 +127,7 @@ def test_truth_is_not_interpolated_across_its_gaps():
 def test_trajectories_of_different_times_are_refused(rng):
     truth = random_walk(rng)
     later = Trajectory(truth.stamps_ns + 3_600_000_000_000, truth.poses)
-    with pytest.raises(TrajectoryError, match=r"0 of 200 poses have a truth.*check the clocks"):
+    with pytest.raises(TrajectoryError, match=r"\b0 of 200\b"):
         match(later, truth)
 
 
@@ -188,7 +188,7 @@ def test_bounds_of_one_sample_are_those_of_chi_square():
 
 
 def test_singular_covariance_is_refused():
-    with pytest.raises(CovarianceError, match="covariance 1 is not positive definite"):
+    with pytest.raises(CovarianceError, match=r"\b1\b.*\[\[1\.0, 0\.0, 0\.0\], .*\[0\.0, 0\.0, 0\.0\]\]"):
         consistency.nees(np.ones((2, 3)), np.array([np.eye(3), np.diag([1.0, 1.0, 0.0])]))
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusal import refusal
 
 from fgloc.errors import OutputError
 from fgloc.files import atomic
@@ -263,15 +264,15 @@ def test_kernel_that_refuses_to_write_keeps_the_old_file(tmp_path):
     assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] != 1000
 
 
-@pytest.mark.parametrize(("out", "said"), [("file", "is a file"), ("file/out", "file is a file"), ("a\0b", "NUL")])
+@pytest.mark.parametrize(("out", "said"), [("file", "file"), ("file/out", "file/out: {}/file "), ("a\0b", "NUL")])
 def test_out_is_checked_before_the_run(tmp_path, out, said):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=said):
+    with refusal(OutputError, said.format(tmp_path)):
         check_out(tmp_path / out)
 
 
 def test_what_is_not_there_is_not_said_to_be_kept():
-    with pytest.raises(OutputError, match=r"^/proc/x: cannot be written \([^()]+\)$"):
+    with pytest.raises(OutputError, match=r"^/proc/x: [^()]+ \([^()]+\)$"):
         check_out(Path("/proc/x"))
 
 
@@ -279,5 +280,5 @@ def test_out_that_can_be_written_leaves_no_trace(tmp_path):
     check_out(tmp_path / "new" / "deep")
     check_out(tmp_path / "map.yaml", folder=False)
     assert os.listdir(tmp_path) == []
-    with pytest.raises(OutputError, match="is a folder"):
+    with refusal(OutputError, tmp_path):
         check_out(tmp_path, folder=False)

@@ -186,7 +186,7 @@ def test_a_matrix_that_is_no_covariance_never_reaches_gtsam(cov):
 
 
 def test_unknown_id_is_named():
-    with pytest.raises(EstimatorError, match="landmark 42 is not in the map"):
+    with pytest.raises(EstimatorError, match=r"\b42\b"):
         LandmarkFactors(wall_map()).sighting(0, PointMeasurement(0, 42, 1.0, 0.0, np.eye(2)), None)
 
 

@@ -1,5 +1,6 @@
 """A clock that is reset alone is corrected; jumps of all, strays and bursts pass as they are."""
 
+import re
 import tracemalloc
 from dataclasses import replace
 
@@ -54,7 +55,7 @@ def test_a_clock_that_is_reset_alone_is_put_back():
     assert np.abs(delays - 0.003).max() < 1e-3
     assert [e.stamp_ns for e in odometries] == sorted(e.stamp_ns for e in odometries)
     assert len(clocks.notes) == 1
-    assert clocks.notes[0].startswith("/odom: its clock alone was reset 1 time(s)")
+    assert re.match(r"/odom: .*\bclock\b.* 1 time", clocks.notes[0])
 
 
 def test_it_may_be_reset_again():

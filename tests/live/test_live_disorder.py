@@ -1,6 +1,7 @@
 """Late, doubled, lost, out of order, in bursts, with clocks reset, twice over: a live run goes on and stays right."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -48,16 +49,14 @@ def disorder(name, events, rng):
         return [received(e, 0.3) if isinstance(e, CornersEvent) else e for e in events]
     if name == "stall":
         return [received(e, 6.0 - after(e)) if 4.5 < after(e) < 6.0 else e for e in events]
-    if name == "stall, topic by topic":
+    if name == "stall of topics":
         order = {"/tags": 0.02, "/odom": 0.0, "/cmd_vel": 0.01}
         held = [received(e, 6.0 + order[e.topic] - after(e)) if 4.5 < after(e) < 6.0 else e for e in events]
         return held
     raise ValueError(name)
 
 
-@pytest.mark.parametrize(
-    "name", ["late", "shuffled", "doubled", "lost", "late camera", "stall", "stall, topic by topic"]
-)
+@pytest.mark.parametrize("name", ["late", "shuffled", "doubled", "lost", "late camera", "stall", "stall of topics"])
 def test_what_goes_wrong_on_the_way_hardly_shows(name, world, orderly):
     events = in_order(disorder(name, world.events(), np.random.default_rng(2)))
     with live_in(world) as live:
@@ -97,7 +96,7 @@ def test_a_publisher_that_restarts_with_its_clock_reset_goes_on(world, orderly):
     with live_in(world) as live:
         made = feed(live, events)
         notes = live.status().notes
-    assert [n for n in notes if n.startswith("/odom: its clock alone was reset")]
+    assert [n for n in notes if re.match(r"/odom: .*\bclock\b", n)]
     assert not [n for n in notes if "clock jumped" in n]
     late = [e for e in made if e.stamp_ns > START_NS + 6.5 * SECOND]
     assert len(late) > 12
@@ -115,7 +114,7 @@ def test_after_a_jump_of_the_common_clock_the_robot_is_found_again(world):
     with live_in(world) as live:
         made = feed(live, [jumped(e) for e in world.events()])
         notes = live.status().notes
-    assert [n for n in notes if "the clock jumped back by 1000.0 s" in n or "the clock jumped back by 999.9 s" in n]
+    assert [n for n in notes if re.search(r"\bclock\b.* (1000\.0|999\.9) s\b", n)]
     again = [dataclasses.replace(e, stamp_ns=e.stamp_ns + 1000 * SECOND) for e in made if e.stamp_ns < START_NS]
     assert len(again) > 10
     assert again[-1].mode is Mode.OK
@@ -158,7 +157,7 @@ def test_a_second_topic_of_a_role_is_not_mixed_in(world, orderly):
     with live_in(world) as live:
         made = feed(live, both)
         status = live.status()
-    assert [n for n in status.notes if n.startswith("/other_odom: a second topic of the role odometry is not used")]
+    assert [n for n in status.notes if re.match(r"/other_odom: .*\bodometry\b", n)]
     assert status.dropped["odometry"] == 200
     assert errors(world, made).mean() == pytest.approx(orderly)
 
@@ -218,7 +217,7 @@ def test_an_unknown_role_is_waited_for_no_longer_than_told():
         events = world.events()
         early = [e for e in events if after(e) < 1.4]
         feed(live, early)
-        assert live.status().waiting_for == ("imu: no message yet",)
+        assert [what.split(":")[0] for what in live.status().waiting_for] == ["imu"]
         assert not live.status().running
         made = feed(live, events[len(early) :])
         assert live.status().running

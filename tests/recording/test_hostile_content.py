@@ -8,12 +8,14 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from recording_bags import START_NS, storage_file, write_drive
+from refusal import refusal
 from test_cli import fgloc, write_circle
 
 from fgloc.cli.terminal import say
 from fgloc.config import Config, GateConfig, RecordingConfig
 from fgloc.errors import MapError, RecordingError
 from fgloc.evaluation.style import plain_label
+from fgloc.files.documents import HostileError
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
@@ -40,7 +42,7 @@ def test_ids_beyond_the_graphs_keys_are_rejected_and_counted(number):
 
 def test_map_with_an_id_beyond_the_graphs_keys_is_refused(tmp_path):
     (tmp_path / "map.yaml").write_text("landmarks:\n  - {id: 0, position: [1, 2]}\n  - {id: 1e21, position: [1, 2]}\n")
-    with pytest.raises(MapError, match=r"map.yaml:3: landmark id 1e\+21 is too large; expected at most 2147483647"):
+    with pytest.raises(MapError, match=r"map.yaml:3: .* 1e\+21 .* 2147483647$"):
         load_map(tmp_path / "map.yaml")
 
 
@@ -125,7 +127,7 @@ def test_metadata_with_a_harmless_alias_is_read(tmp_path):
 def test_fault_65_metadata_with_a_bomb_is_refused(tmp_path, name):
     folder = write_drive(tmp_path / "run", n=5)
     (folder / "metadata.yaml").write_text(SYNTAX[name])
-    with pytest.raises(RecordingError, match=r"delete its metadata\.yaml"):
+    with refusal(RecordingError, folder / "metadata.yaml", cause=HostileError):
         open_recording(folder, RecordingConfig())
 
 
@@ -133,5 +135,5 @@ def test_pipe_as_recording_is_refused(tmp_path):
 
     for name in ("pipe", "pipe.mcap", "pipe.bag"):
         os.mkfifo(tmp_path / name)
-        with pytest.raises(RecordingError, match=r"unknown kind|not a regular file"):
+        with refusal(RecordingError, tmp_path / name):
             open_recording(tmp_path / name, RecordingConfig())

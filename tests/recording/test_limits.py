@@ -2,6 +2,7 @@
 
 import bz2
 import json
+import re
 import sqlite3
 
 import cv2
@@ -99,9 +100,9 @@ def test_decompression_is_bounded_and_exact(kind):
     with pytest.raises(OverflowError):
         decompressed(kind, packed, len(data) - 1)
     for damaged in (packed[:-5], packed[: len(packed) // 2]):
-        with pytest.raises(ValueError, match="ends too early"):
+        with pytest.raises(ValueError, match=kind):
             decompressed(kind, damaged, len(data))
-    with pytest.raises(ValueError, match="more than 1000 frames"):
+    with pytest.raises(ValueError, match=r"\b1000\b"):
         decompressed(kind, COMPRESS[kind](b"x") * 1001, 10_000)
     with pytest.raises(ValueError, match="unknown compression"):
         decompressed("xz", b"", 1)
@@ -115,7 +116,7 @@ def test_budget_grows_with_the_file(tmp_path):
     budget.check(budget.limit)
     budget.start_pass()
     budget.spend(budget.limit)
-    with pytest.raises(TooLargeError, match="if you trust it, decompress it first"):
+    with pytest.raises(TooLargeError, match=re.escape(str(path))):
         budget.spend(1)
 
 
@@ -198,9 +199,9 @@ def test_image_sizes_are_those_of_the_headers():
         data[at : at + (8 if suffix == ".png" else 4)] = (
             b"\0\0\x40\0\0\0\x40\1" if suffix == ".png" else b"\xff\xff\xff\xff"
         )
-        with pytest.raises(ImageError, match="expected at most 16777216 in all"):
+        with pytest.raises(ImageError, match=r"\b16777216\b"):
             decode(message(bytes(data)))
-    with pytest.raises(ImageError, match="expected at most"):
+    with pytest.raises(ImageError, match="5000x5000"):
         decode(message(b"\0", encoding="mono8", compressed=False, width=5000, height=5000))
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from motion_models import make_card, make_tensors
+from refusal import refusal
 
 from fgloc.assembly import assemble
 from fgloc.config import Config, RecordingConfig
@@ -65,9 +66,8 @@ def test_a_recording_with_camera_and_map_gives_all_parts(tmp_path):
 
 
 def test_without_motion_the_topics_that_are_there_are_named(tmp_path):
-    with pytest.raises(RecordingError, match="no odometry, joint states or commands") as caught:
+    with refusal(RecordingError, "/camera/image/compressed (sensor_msgs/msg/CompressedImage)"):
         build(tmp_path, motion=False)
-    assert "/camera/image/compressed (sensor_msgs/msg/CompressedImage)" in str(caught.value)
 
 
 def test_fault_36_images_without_camera_info_name_the_remedy(tmp_path):
@@ -83,7 +83,7 @@ def test_fault_36_a_calibration_file_stands_in(tmp_path):
 
 
 def test_fault_39_another_image_size_is_refused(tmp_path):
-    with pytest.raises(CameraError, match=r"images are 320x240, the calibration is for 640x480.*camera\.rescale"):
+    with pytest.raises(CameraError, match=r"\b320x240\b.*\b640x480\b.*camera\.rescale"):
         build(tmp_path, image=(320, 240))
 
 

@@ -7,6 +7,7 @@ import pytest
 import fgloc
 from fgloc.ablation.failures import events_of
 from fgloc.config import load_config
+from fgloc.estimation.log import OVERRULED
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.runner import run
 from fgloc.sensors.base import with_values
@@ -20,7 +21,7 @@ def test_a_model_of_another_robot_is_named_and_left_out():
     folder = SAMPLES / "patches_run"
     foreign = with_values(load_config(folder / "robot.yaml"), "motion", {"model": MODEL})
     result = run(folder / "bag", folder / "map.yaml", foreign, "online")
-    assert result.mistakes[0].startswith("The motion model was left out for")
+    assert result.findings[0].code == "motion.model"
     assert result.notes[0] == result.mistakes[0]
     metrics = compute_metrics(result, result.config)
     assert metrics.ate_mean_m < 0.006  # with it 0.06
@@ -68,7 +69,7 @@ def test_no_landmark_is_named_by_a_pose_that_sightings_overrule():
     config = with_values(config, "gyro", {"use": False})
     result = run(folder / "bag", folder / "map.yaml", config, "online", events=dark(2.0, 22.0, 48.0))
     reasons = [d.reason for d in result.decisions]
-    assert "overruled by sightings" in reasons
+    assert OVERRULED in reasons
     assert "landmark_moved" not in reasons
 
 

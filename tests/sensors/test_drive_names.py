@@ -63,7 +63,7 @@ def test_init_names_the_drive_and_asks_for_its_geometry(tmp_path, names, angles,
     found = first_settings(write(tmp_path, names, angles))
     for line in lines:
         assert f"#     {line}" in found.text
-    assert any("geometry of the drive" in sentence for sentence in found.missing)
+    assert any("wheels.drive" in sentence for sentence in found.missing)
 
 
 def test_wheels_in_no_known_places_are_asked_for(tmp_path):

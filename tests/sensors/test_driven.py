@@ -114,7 +114,7 @@ def test_rates_of_ticks_are_not_used():
 
 def test_missing_joints_are_named_with_those_that_there_are():
     names = ["f_l", "fr", "rl", "rr"]
-    with pytest.raises(ConfigError, match=r"missing: fl \(did you mean 'f_l'\?\).*the last holds f_l"):
+    with pytest.raises(ConfigError, match=r" fl \(.*'f_l'.*\).* f_l, fr, rl, rr"):
         motion_over(wheels(MECANUM), messages(turned, names))
 
 
@@ -123,7 +123,7 @@ def test_joints_without_values_are_named():
         JointsEvent(ns(t), ns(t), "/j", tuple(WHEELS), np.full(4, np.nan), np.empty(0), np.empty(0))
         for t in np.arange(0, 2, 0.02)
     )
-    with pytest.raises(ConfigError, match="angles or rates"):
+    with pytest.raises(ConfigError, match=", ".join(WHEELS)):
         motion_over(wheels(MECANUM), events)
 
 

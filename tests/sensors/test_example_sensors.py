@@ -21,6 +21,7 @@ from fgloc.errors import ConfigError
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.extensions import outside_sensors
 from fgloc.intake.keyframing import KeyframeBuilder
+from fgloc.recording.info import inspect
 from fgloc.runner import run
 from fgloc.sensors.base import Context, with_values
 from fgloc.sensors.gyro import Gyro
@@ -111,9 +112,9 @@ def test_sections_and_roles_come_from_the_entry_points(uwb, tmp_path):
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("uwb: {sigma: 0.1}", "did you mean 'sigma_m'"),
+        ("uwb: {sigma: 0.1}", "uwb.sigma: .*'sigma_m'"),
         ("uwb: {sigma_m: -1}", "uwb.sigma_m"),
-        ("recording: {topics: {uwbb: /x}}", "did you mean 'uwb'"),
+        ("recording: {topics: {uwbb: /x}}", "uwbb: .*'uwb'"),
         ("recording: {received_stamps: [lidar]}", "lidar"),
     ],
 )
@@ -128,15 +129,15 @@ def test_without_the_package_its_section_is_an_unknown_key(folders, monkeypatch,
     path = tmp_path / "robot.yaml"
     path.write_text("uwb: {sigma_m: 0.1}")
     monkeypatch.setattr("fgloc.config.outside_sensors", lambda: ())
-    with pytest.raises(ConfigError, match="uwb: unknown key"):
+    with pytest.raises(ConfigError, match=r"robot\.yaml:1: uwb: "):
         load_config(path)
 
 
 @pytest.mark.parametrize(
     ("module", "wrong"),
     [
-        ("raise RuntimeError('no driver')", "RuntimeError: no driver.*repair or uninstall broken"),
-        ("class Sensor: name = 'lidar'", "lacks Config, streams"),
+        ("raise RuntimeError('no driver')", "RuntimeError: no driver.* broken"),
+        ("class Sensor: name = 'lidar'", "Config, streams"),
     ],
 )
 def test_a_package_that_is_no_sensor_is_named(tmp_path, monkeypatch, module, wrong):
@@ -418,7 +419,8 @@ def test_info_names_their_topics(recording, folders):
     done = command_line(folders, "info", str(recording / "bag"))
     assert done.returncode == 0, done.stderr
     assert re.search(r"sensor_msgs/NavSatFix .* gnss\n", done.stdout)
-    assert "nothing bounds the drift" not in done.stdout
+    unbounded = [f.text for f in inspect(recording / "bag", Config()).found if f.code == "place.unbounded"]
+    assert not [text for text in unbounded if text in done.stdout]
 
 
 @pytest.mark.slow

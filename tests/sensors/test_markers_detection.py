@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from marker_scenes import forward_camera, image_event, project, render, standing, texture
+from refusal import refusal
 
 from fgloc.config import MarkersConfig
 from fgloc.errors import ConfigError
@@ -76,9 +77,9 @@ def test_names_may_be_written_in_any_case() -> None:
 
 
 def test_unknown_dictionary_is_an_error_that_lists_the_names() -> None:
-    with pytest.raises(ConfigError, match=r"'DICT_4X4_51' is not known.*DICT_4X4_50.*DICT_APRILTAG_36h11"):
+    with pytest.raises(ConfigError, match=r"'DICT_4X4_51'.*DICT_4X4_50.*DICT_APRILTAG_36h11"):
         detector("DICT_4X4_51")
-    with pytest.raises(ConfigError, match=r"absent\.yml: cannot be read .*marker dictionary"):
+    with refusal(ConfigError, "absent.yml", cause=FileNotFoundError):
         detector("absent.yml")
 
 
@@ -192,9 +193,9 @@ def test_stream_reads_only_a_few_images_ahead() -> None:
 def test_stream_hands_on_errors_of_its_source_and_stops_its_thread_when_left() -> None:
     def failing() -> Iterator[Event]:
         yield from stream(2)
-        raise RuntimeError("bag ends here")
+        raise RuntimeError("bag ends")
 
-    with pytest.raises(RuntimeError, match="bag ends here"):
+    with pytest.raises(RuntimeError, match="bag ends"):
         list(detect_stream(failing(), detector("DICT_4X4_50"), Counter()))
     left = detect_stream(stream(20), detector("DICT_4X4_50"), Counter())
     next(left)

@@ -249,9 +249,9 @@ def test_noise_density_adds_up() -> None:
 
 def test_prediction_needs_a_command_and_a_length(rng: np.random.Generator, tmp_path: Path) -> None:
     model, events = model_of("displacement", rng, tmp_path), commands(rng)
-    with pytest.raises(ModelError, match="no command"):
+    with pytest.raises(ModelError, match="command"):
         model.predict((), T0, T0 + SECOND, None)
-    with pytest.raises(ModelError, match="not after its start"):
+    with pytest.raises(ModelError, match=rf"\b{T0}\b.*\b{T0}\b"):
         model.predict(events, T0, T0, None)
 
 

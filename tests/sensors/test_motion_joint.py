@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusal import refusal
 
 from fgloc import se2
 from fgloc.errors import CovarianceError
@@ -105,7 +106,7 @@ def test_impossible_covariances_are_refused() -> None:
     with pytest.raises(CovarianceError, match=r"norm 1\.5"):
         JointCalibration(eye, eye, 1.5 * eye)
     for W, N in ((-eye, eye), (eye, np.full((3, 3), np.nan)), (np.zeros((3, 3)), eye)):
-        with pytest.raises(CovarianceError, match="not positive definite"):
+        with refusal(CovarianceError, cause=np.linalg.LinAlgError):
             JointCalibration(W, N, np.zeros((3, 3)))
     with pytest.raises(ValueError, match="one step"):
         JointCalibration(eye, eye, 0 * eye).decorrelate(

@@ -147,7 +147,7 @@ def test_readings_that_are_not_numbers_are_holes(tmp_path: Path, rng: np.random.
     both = tuple(
         replace(e, names=("front_left_wheel", "rear_left_wheel", "right_wheel")) for e in whole.of(JointsEvent)
     )
-    with pytest.raises(ConfigError, match="2 joints could be the left wheel"):
+    with pytest.raises(ConfigError, match="front_left_wheel, rear_left_wheel"):
         source.measure(with_events(whole, JointsEvent, both))
 
 
@@ -184,7 +184,7 @@ def test_contiguous_steps_remember_and_others_begin_anew() -> None:
 def test_a_model_is_not_asked_without_its_signals(tmp_path: Path, rng: np.random.Generator) -> None:
     source = source_of(tmp_path, rng, ("commands", "gyro"))
     step = drive(3.0, 3.2)
-    with pytest.raises(ModelError, match="reads gyro, which the step has not"):
+    with pytest.raises(ModelError, match=r"\bgyro\b"):
         source.model.predict(step.controls, step.start_ns, step.stamp_ns, None)
 
 

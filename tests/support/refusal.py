@@ -7,7 +7,7 @@ import pytest
 
 @contextmanager
 def refusal(error, *facts, cause=None):
-    """Expect this error, which names the facts: a file, a key, a value; `cause` is the type that it comes from."""
+    """Expect this error, which names the facts: a file, a key, a value; `cause` is the type it comes from."""
     with pytest.raises(error) as caught:
         yield caught
     said = str(caught.value)

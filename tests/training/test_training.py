@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 import yaml
 from command_line import fgloc
+from refusal import refusal
 from synthetic_robot import SECOND, sensing, synthetic, write_bag
 
 from fgloc import se2
@@ -271,7 +273,7 @@ def test_killed_training_goes_on_and_ends_at_the_same_bytes(
 
 def test_damaged_checkpoint_is_named(tmp_path: Path) -> None:
     (tmp_path / "c.pt").write_bytes(b"PK not a checkpoint")
-    with pytest.raises(ModelError, match=r"c\.pt: not a sound checkpoint"):
+    with refusal(ModelError, tmp_path / "c.pt"):
         Checkpoint(tmp_path / "c.pt").load()
 
 
@@ -290,7 +292,7 @@ def test_command_lines(tmp_path: Path) -> None:
     made = sorted(p.name for p in (tmp_path / "models").iterdir())
     names = ("all", *(f"without_run{i}" for i in range(3)))
     assert made == sorted(["controls.png", *(f"{n}.{end}" for n in names for end in ("safetensors", "losses.png"))])
-    assert "hold too little of v from 0.38 to 0.5 m/s: 0.0 s, want 5 s" in err
+    assert re.search(r"\bv\b.* 0\.38\b.* 0\.5 m/s\b.* 0\.0 s\b.* 5 s\b", err)
     from_all = load_model(tmp_path / "models" / "all.safetensors").card
     assert from_all.split.train == ("run0", "run1", "run2")
     assert from_all.joint is not None
@@ -306,7 +308,7 @@ def test_command_lines(tmp_path: Path) -> None:
     assert {row["source"] for row in rows} == {"commands", "calibrated commands", "model", "all"}
     code, _, err = fgloc("evaluate-model", tmp_path / "config.yaml", tmp_path / "run2" / "bag")
     assert code == 1
-    assert "not a sound safetensors file" in err
+    assert str(tmp_path / "config.yaml") in err
 
 
 def test_model_is_adapted_to_another_robot_from_a_minute(runs: dict[str, Run], tmp_path: Path) -> None:
@@ -334,7 +336,7 @@ def test_model_is_adapted_to_another_robot_from_a_minute(runs: dict[str, Run], t
         return evaluation.evaluate([roll_model(load_model(path), runs["run4"], 0.2)], 10.0).drift_percent
 
     assert drift(tmp_path / "adapted.safetensors") < 0.9 * drift(wrong)
-    with pytest.raises(ConfigError, match="give one, not leave_one_out"):
+    with pytest.raises(ConfigError, match="leave_one_out"):
         training.adapt(wrong, base, runs, tmp_path / "never.safetensors", "a test")
 
 
@@ -370,7 +372,7 @@ def test_configuration_is_strict(tmp_path: Path) -> None:
         path.write_text(yaml.safe_dump(good | change))
         with pytest.raises(ConfigError, match=message):
             load_train_config(path)
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with refusal(ConfigError, tmp_path / "none.yaml", cause=FileNotFoundError):
         load_train_config(tmp_path / "none.yaml")
     shipped = list((Path(__file__).parent.parent.parent / "training" / "configs").glob("*.yaml"))
     assert shipped

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusal import refusal
 from scipy.signal import lfilter
 from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
@@ -104,12 +105,12 @@ def test_smoothed_trajectory_stands_in_for_the_truth(tmp_path: Path) -> None:
     own = load_run(tmp_path / "bag", "b", 0.1, 2.0, config)
     picked = [np.interp(at[run.valid], own.times + (own.origin_ns - T0) * 1e-9, column) for column in own.poses.T]
     np.testing.assert_allclose(run.poses[run.valid] - [1.0, 2.0, 0.0], np.column_stack(picked), atol=0.02)
-    with pytest.raises(TrajectoryError, match=r"no pose is known to 0\.01 m, the best to 0\.014 m"):
+    with pytest.raises(TrajectoryError, match=r"\b0\.01 m\b.*\b0\.014 m"):
         load_run(tmp_path / "bag", "b", 0.1, 2.0, DataConfig(max_truth_sigma_m=0.01), folder)
-    with pytest.raises(TrajectoryError, match="cannot be read"):
+    with refusal(TrajectoryError, tmp_path / "elsewhere"):
         load_run(tmp_path / "bag", "b", 0.1, 2.0, config, tmp_path / "elsewhere")
     (folder / "covariance.csv").write_text("stamp,xx\n1.0,oops\n")
-    with pytest.raises(TrajectoryError, match="not a table of covariances"):
+    with refusal(TrajectoryError, folder / "covariance.csv", "oops"):
         load_run(tmp_path / "bag", "b", 0.1, 2.0, config, folder)
 
 
@@ -138,7 +139,7 @@ def test_recordings_that_cannot_identify_a_robot(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "silent") as bag:
         bag.command("/cmd_vel", T0, 0.1, 0.0)
         bag.command("/cmd_vel", T0 + SECOND, 0.1, 0.0)
-    with pytest.raises(RecordingError, match="0 messages of truth"):
+    with pytest.raises(RecordingError, match=r"\b0\b.*\btruth\b"):
         load_run(tmp_path / "silent", "silent", 0.1, 2.0, DataConfig())
     commands, stamps, poses = drive(np.random.default_rng(0), 20.0)
     with pytest.raises(RecordingError, match=r"overlap for 0.0 s"):
