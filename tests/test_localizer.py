@@ -191,7 +191,8 @@ def test_fault_15_a_clock_that_jumps_back_begins_a_segment_that_finds_the_robot_
     assert len(before) > 55
     assert len(after) > 55
     assert np.mean([position_error(e, second.truth(e.stamp_ns)) for e in after]) < 0.01
-    assert len(chain.stepper.notes) == 1
+    [note] = chain.stepper.notes
+    assert "clock" in note
     assert chain.localizer.counts["prior"] == 2
 
 
