@@ -7,6 +7,7 @@ fgloc with what it wrote, and the same messages through other programs. ATE is t
 - ``odometry``: the robot's own, or its integrated commands.
 - ``isam2``: the textbook's iSAM2 of `benchmarks.field_peers`, online and smoothed, with the best constants of a search
   along each of them in turn, on the recordings marked for development (least geometric mean of ATE over odometry).
+- ``untuned``: the same with what an engineer writes down before the first run.
 - Others take part by their poses. ``--export DIR`` writes each recording as a bag with its ``map.yaml`` and ends;
   ``--poses NAME=DIR`` reads ``DIR/RECORDING.tum`` into the same table. In a map's frame they are compared as they are.
 
@@ -36,7 +37,7 @@ import numpy as np
 
 from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field import ates, landmarks_of, ran_through
-from benchmarks.field_peers import Constants, Heard, hear, textbook
+from benchmarks.field_peers import UNTUNED, Constants, Heard, hear, textbook
 from benchmarks.field_recordings import RECORDINGS, Recording
 from benchmarks.field_sheet import MODES, Mode
 from fgloc.files.atomic import atomic_file
@@ -64,8 +65,9 @@ def others(heard: Heard, landmarks: Mapping[int, FloatArray]) -> dict[str, Traje
     found: dict[str, Trajectory] = {}
     if heard.odometry is not None:
         found |= {"odometry.online": heard.odometry, "odometry.batch": heard.odometry}
-    if (plain := textbook(heard, landmarks, constants=ISAM2)) is not None:
-        found["isam2.online"], found["isam2.batch"] = plain
+    for name, constants in (("isam2", ISAM2), ("untuned", UNTUNED)):
+        if (plain := textbook(heard, landmarks, constants=constants)) is not None:
+            found[f"{name}.online"], found[f"{name}.batch"] = plain
     return found
 
 
@@ -168,7 +170,7 @@ _HEAD = """# Public bench
 
 Recordings that others made, with truth and landmarks: ATE [m] of fgloc with defaults after `fgloc init`, and of other programs on the same messages, losses first.
 Programs, their constants and the error are described in `benchmarks/public.py`. On a map the others start at the truth's first pose; fgloc has to find its own. Constants of
-`isam2` are the best on the recordings marked *dev*. Another program takes part by its poses (`--export`, `--poses`).
+`isam2` are the best on the recordings marked *dev*, those of `untuned` were never chosen. Another program takes part by its poses (`--export`, `--poses`).
 
 | recording | {programs} | best other / fgloc: batch | online |
 |---|{dashes}---|---|
