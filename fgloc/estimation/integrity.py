@@ -36,6 +36,7 @@ _OVERBOUND = 1.3
 _DISPLACED = 1e-3  # prior that a given landmark of a map stands elsewhere, and nobody knows
 _SLIP_PER_S = 0.01  # slips that the motion sources do not show, for each second, beside as many as they do show ...
 _SLIP_LASTS_S = 1.0  # ... each at most so long, at the speed of the wheels
+_FARTHEST = 1e4  # m², rad²: variance of a slip, whatever the wheels say of their speed
 _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
 _WRONG_JUMP = 1e-2  # probability that a place to which the estimate jumps is wrong ...
 _BY_ACCIDENT = 0.1  # ... and that a sighting agrees with it nevertheless
@@ -230,7 +231,7 @@ class ProtectionLevels:
         turn = max(turn, _LEAST_RAD_S) if linear > 0.0 else turn
         expected = (_SLIP_PER_S + slips_per_s) * blind_s
         off = np.square(np.array([linear, linear, turn]) * min(blind_s, _SLIP_LASTS_S)) * (1.0 + expected)
-        off *= _CHECKED**2 if checked else 1.0
+        off = np.minimum(off * (_CHECKED**2 if checked else 1.0), _FARTHEST)
         goes_on = self._slipped * math.exp(-blind_s / _SLIP_LASTS_S)  # a slip that has begun
         share, bias, spread = goes_on - (1.0 - goes_on) * math.expm1(-expected), np.zeros(3), np.diag(off)
         if since_fix_s == 0.0 and fix is not None:

@@ -267,3 +267,15 @@ def test_a_place_found_anew_is_believed_once_enough_sightings_agree_with_it():
     assert bounds[0].alert
     assert bounds[-1].cause == "noise"
     assert not bounds[-1].alert
+
+
+@pytest.mark.parametrize("seed", [1, 2, 4])
+def test_wheels_that_report_any_speed_leave_a_bound(seed):
+    """Four numbers of three unknowns: what is left of their noise beside such a slip is below rounding."""
+    modes, H = Modes(), np.random.default_rng(seed).normal(0.0, 100.0, (4, 3))
+    modes.mounts.take(0, H, np.eye(4), np.ones(4), H.T * 1e-7, ["corners"] * 4)
+    lines = Lines(np.ones(4), H, np.zeros((4, 0)), [4], np.array([False]))
+    none = InstallationEstimate(np.zeros(0), np.zeros((0, 0)))
+    fix = Fix(PoseWithCovariance(STILL, COV), none, lines, 0.5)
+    found = ProtectionLevels(IntegrityConfig(), modes).of(COV, np.array([1e12, 0.0, 1e9]), 0.0, False, fix=fix)
+    assert np.isfinite(found.bound).all()
