@@ -177,6 +177,8 @@ _CONVERTED = f"{EXPECTED} (fgloc convert reads some public data sets)"
 
 def _other_name(path: Path) -> str:
     """Advice where the content is of another kind than the name says; "" where it is of none that is known."""
+    if not path.is_file():  # to open a pipe waits for its other end
+        return ""
     try:
         with path.open("rb") as file:
             head = file.read(16)

@@ -93,7 +93,7 @@ def ran(handled, request) -> RunResult:
 def codes(found: RunResult | RecordingInfo) -> dict[str, float | None]:
     """Value of each finding of the motion, by code."""
     findings = found.findings if isinstance(found, RunResult) else found.found
-    return {f.code: f.value for f in findings if f.code.split(".")[0] not in ("run", "recording")}
+    return {f.code: f.value for f in findings if f.code.split(".")[0] not in ("run", "recording", "place")}
 
 
 def sigmas(result: RunResult, second: float) -> np.ndarray:
