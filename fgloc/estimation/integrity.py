@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from fgloc.config import IntegrityConfig
-from fgloc.estimation.landmark_modes import LandmarkModes
+from fgloc.estimation.landmark_modes import LandmarkModes, posterior
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import innovation, joint_cov
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -41,7 +41,6 @@ _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sou
 _WRONG_JUMP = 1e-2  # probability that a place to which the estimate jumps is wrong ...
 _BY_ACCIDENT = 0.1  # ... and that a sighting agrees with it nevertheless
 _LONG_AGO = 100
-_SURE = 1.0 - 1e-12
 _ELSEWHERE = np.diag(np.square([10.0, 10.0, 1.8]))  # m², m², rad²
 _UNBOUNDED = np.full(3, np.inf)
 _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
@@ -113,8 +112,7 @@ class Fix:
         log_slipped, moved, wide = _corrected(
             found.residual, found.cov + (H * off) @ H.T, cross + H * off, before + np.diag(off)
         )
-        odds = math.log(max(prior, 1e-300)) - math.log1p(-min(prior, _SURE)) + log_slipped - log_sound
-        share = 1.0 / (1.0 + math.exp(-float(np.clip(odds, -700.0, 700.0))))
+        share = posterior(prior, 2.0 * (log_slipped - log_sound))
         return share, moved - sound, _OVERBOUND**2 * (wide - cov)
 
 
@@ -182,7 +180,7 @@ class ProtectionLevels:
             carried: probability that the robot was carried away, and covariance ``(3, 3)`` of the error then.
         """
         slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
-        self._modes.mounts.weigh()  # what is left
+        self._modes.mounts.weigh()  # sightings that no slip can have come before
         faults = [
             _Fault(f"landmark {landmark_id}", share, np.abs(bias), _directions(spread))
             for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED)
@@ -254,7 +252,7 @@ class ProtectionLevels:
         mean, sigma, most = np.zeros((len(share), 4)), np.tile(sound, (len(share), 1)), np.zeros((len(share), 4))
         for i, fault in enumerate(faults, 1):
             mean[i] = *fault.mean, math.hypot(fault.mean[0], fault.mean[1])
-            sigma[i] = np.sqrt(sound**2 + fault.added)
+            sigma[i] = np.sqrt(sound**2 + np.maximum(fault.added, 0.0))  # a difference of two covariances is rounded
             most[i] = *fault.most, fault.most[0]
 
         def beyond(bound: FloatArray) -> FloatArray:

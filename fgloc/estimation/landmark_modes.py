@@ -83,8 +83,8 @@ def rotation_cov(H: FloatArray, rows: tuple[int, int]) -> FloatArray:
 
 _KNOCKED = np.array([0.03, 0.03, 0.05])  # m, m, rad: sigma of a mounting's change, in the base's axes
 _WRONG_FROM_THE_START = 1e-4  # probability that a mounting is another one than it was measured to be ...
-_KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards ...
-_LEVEL = 0.5  # ... of a camera so many: the others tilt it, and what it sees of markers contradicts that
+_KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards
+_LEVEL = 0.5  # share of a camera's changes that do not tilt it: markers in its images contradict a tilt
 _MOST_ONSETS = 8  # of one sensor
 
 
@@ -123,6 +123,8 @@ class _Onsets:
 
     def weigh(self, w: FloatArray, G: FloatArray, prior: float, wider: FloatArray) -> None:
         """Add the evidence of white innovations, of which a slip of the wheels is another explanation.
+
+        Of the two, slip or none, δ is corrected by the one that is more probable with the onset.
 
         Args:
             w: ``(d,)``.
@@ -243,16 +245,16 @@ class MountModes:
         for name, one in self._of.items():
             M, spread = one.M[:, :3], np.linalg.inv(one.information)
             for k, prior in enumerate(one.prior.tolist()):
-                share = _share(prior, float(one.evidence[k]))
+                share = posterior(prior, float(one.evidence[k]))
                 yield name, share, M[k] @ one.moved[k], M[k] @ spread[k] @ M[k].T
 
 
-_SURE = 1.0 - 1e-12
+_SURE, _HARDLY = 1.0 - 1e-12, 1e-300  # probabilities whose odds are finite
 
 
-def _share(prior: float, evidence: float) -> float:
+def posterior(prior: float, evidence: float) -> float:
     """Probability of a hypothesis by its prior, and twice the log-likelihood ratio to its contrary."""
-    odds = math.log(prior) - math.log1p(-min(prior, _SURE)) + 0.5 * min(max(evidence, -1e3), 1e3)
+    odds = math.log(max(prior, _HARDLY)) - math.log1p(-min(prior, _SURE)) + 0.5 * min(max(evidence, -1e3), 1e3)
     return 1.0 / (1.0 + math.exp(-odds))
 
 
@@ -325,7 +327,7 @@ class LandmarkModes:
         bias = np.einsum("lij,lj->li", M, self._moved)
         for landmark_id, row in self._rows.items():
             if not self.excludes(landmark_id):
-                yield landmark_id, _share(prior, float(evidence[row])), bias[row], spread[row]
+                yield landmark_id, posterior(prior, float(evidence[row])), bias[row], spread[row]
 
     def sensitivity(self, landmark_id: int) -> FloatArray:
         """Derivative ``(3 + n, 2)`` of the error of pose and installation by a landmark's displacement."""

@@ -329,9 +329,10 @@ def read_document(
 
 
 def _indented_by_tab(text: str, cause: yaml.YAMLError) -> int | None:
-    """Number of the line whose tab the reader stumbled over; None if it was something else."""
+    """Number of the line that begins with a tab, where the reader stumbled over it; None: over something else."""
     mark = cause.problem_mark if isinstance(cause, yaml.MarkedYAMLError) else None
     lines = text.splitlines()
-    if mark is None or mark.line >= len(lines) or "\t" not in lines[mark.line][: mark.column + 1]:
+    if mark is None or mark.line >= len(lines):
         return None
-    return int(mark.line) + 1
+    line = lines[mark.line]
+    return int(mark.line) + 1 if "\t" in line[: len(line) - len(line.lstrip())] else None

@@ -46,7 +46,7 @@ def write(folder, places=PLACES, sightings=False):
 
 
 def unbounded(folder):
-    """What `fgloc info` says of the recording, without settings: nothing places the robot."""
+    """Without settings `fgloc info` says that nothing places the robot."""
     [text] = [f.text for f in inspect(folder / "bag", Config()).found if f.code == "place.unbounded"]
     return text
 

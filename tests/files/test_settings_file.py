@@ -213,3 +213,9 @@ def test_dictionary_file_that_never_ends_is_refused(tmp_path):
 def test_a_line_that_is_indented_by_a_tab_is_named(write):
     with pytest.raises(ConfigError, match=r"robot\.yaml.*line 3 .*\btab\b"):
         load_config(write("wheels:\n  scale_v: 1.0\n\tscale_w: 1.0\n"))
+
+
+def test_white_space_within_a_line_is_not_taken_for_the_mistake(write):
+    with pytest.raises(ConfigError) as refused:
+        load_config(write('wheels:\n  scale_v:\t"1.0\n'))
+    assert "tab" not in str(refused.value)
