@@ -16,6 +16,7 @@ from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import RobotFile, with_findings
 from fgloc.config import Config, NoiseDensity, base_roles, config_of_file, setting
 from fgloc.errors import FglocError
+from fgloc.graph.batch import of_whole_run
 from fgloc.graph.contradictions import smoothed_within_priors
 from fgloc.graph.measurement_log import Keyframe
 from fgloc.graph.noise import FusionRules, NoiseBudget
@@ -105,7 +106,8 @@ def _most_likely(
         parts = assemble(recording, map_path, config, True)
         longest_s = _EXCERPT_S if parts.detector is None else _IMAGES_S
         replay = replayed(recording, parts, "batch", progress, {"events": lambda events: _first(events, longest_s)})
-    log, factors = parts.localizer.estimator.log, parts.localizer.factors
+    log = parts.localizer.estimator.log
+    factors = of_whole_run(log, parts.localizer.factors)
     if not replay.estimates or factors.installation.ground:
         return None
     solver, _ = smoothed_within_priors(log, factors, config.batch, config.estimator.gate_probability)

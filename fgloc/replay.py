@@ -16,10 +16,10 @@ import numpy as np
 from fgloc import se2
 from fgloc.assembly import Assembly
 from fgloc.config import Role
-from fgloc.graph.batch import BatchSmoother, Smoothed
+from fgloc.graph.batch import BatchSmoother, Smoothed, of_whole_run
 from fgloc.graph.contradictions import Contradiction, as_given, smoothed_within_priors, spread
 from fgloc.graph.ground import ground_at
-from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.intake.clocks import TopicClocks
 from fgloc.recording.reader import Recording
 from fgloc.recording.truth import TruthTrack
@@ -279,7 +279,8 @@ class SmoothedRun:
     estimates: list[Estimate]
     landmarks: LandmarkMap | None  # given or estimated
     notes: tuple[str, ...]
-    installation: InstallationEstimate
+    parameters: Installation
+    installation: InstallationEstimate  # of these
     cost: float
     contradiction: Contradiction | None = None  # constants that are not used as they were found
 
@@ -296,14 +297,15 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     localizer, config = parts.localizer, parts.config
     log = localizer.estimator.log
     probability = config.estimator.gate_probability
-    solver, contradiction = smoothed_within_priors(log, localizer.factors, config.batch, probability)
+    factors = of_whole_run(log, localizer.factors)
+    solver, contradiction = smoothed_within_priors(log, factors, config.batch, probability)
     notes = []
     result, installed = solver.result(), solver.installed()
     if contradiction is not None:
         result.covs[:] += spread(
             result.poses, contradiction.rivals or ()
         )  # a view of `ground_covs`, where there is one
-        installed = as_given(installed, localizer.factors.installation, contradiction.names)
+        installed = as_given(installed, factors.installation, contradiction.names)
     estimates = [
         Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.added_cov, float(pose[2])), frame.mode, (), ground)
         for frame, pose, cov, ground in zip(
@@ -314,7 +316,9 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
     notes.append(f"Batch: {len(estimates)} keyframes, cost {result.error:.1f}.")
-    return SmoothedRun(estimates, landmarks, tuple(notes), installed, solver.cost(), contradiction)
+    return SmoothedRun(
+        estimates, landmarks, tuple(notes), factors.installation, installed, solver.cost(), contradiction
+    )
 
 
 def _ground(solver: BatchSmoother, result: Smoothed) -> Iterator[Ground | None]:

@@ -177,8 +177,10 @@ def run(
     estimates = last_pass(all_estimates)
     held = parts.localizer.tracking.initial_pose_conflict is not None
     sane = parts.sanity.judge(estimates, causal=mode == "online", held=held)
-    installed = parts.localizer.estimator.installed if smoothed is None else smoothed.installation
-    found = installation_found(parts, outcome.roles, installed)
+    estimator = parts.localizer.estimator
+    installation = estimator.installation if smoothed is None else smoothed.parameters
+    installed = estimator.installed if smoothed is None else smoothed.installation
+    found = installation_found(parts, outcome.roles, installation, installed)
     contradiction = _contradiction(parts) if smoothed is None else smoothed.contradiction
     of_constants = contradiction_findings(found, contradiction, config) or contradictions(found, config)
     findings = [
@@ -204,9 +206,7 @@ def run(
         spans=replay.activity.spans(estimates[0].stamp_ns),
         source=recording_path,
         found=found,
-        installation=found_values(
-            parts.localizer.factors.installation, installed, parts.config, parts.cameras, parts.landmark_map
-        ),
+        installation=found_values(installation, installed, parts.config, parts.cameras, parts.landmark_map),
         cost=None if smoothed is None else smoothed.cost,
         first_pose_s=replay.first_pose_s,
         config=config,

@@ -135,9 +135,11 @@ _SIGMAS = {  # the field that takes the sigma of settings back; of several the l
 }
 
 
-def installation_found(parts: Assembly, roles: Container[str], belief: InstallationEstimate) -> InstallationFound:
+def installation_found(
+    parts: Assembly, roles: Container[str], installation: Installation, belief: InstallationEstimate
+) -> InstallationFound:
     """Installation estimated by a run of these parts, for a recording with these roles."""
-    installation, landmark_map, source = parts.localizer.factors.installation, parts.landmark_map, parts.wheels.source
+    landmark_map, source = parts.landmark_map, parts.wheels.source
     n = installation.constants  # height, roll and pitch of a pose are no installation
     found = InstallationFound(
         installation.names[:n],

@@ -187,6 +187,11 @@ class MountModes:
         self._of.clear()
         self._taken = None
 
+    def forget_states(self, at: slice) -> None:
+        """No change of a mounting has had a part in these states."""
+        for one in self._of.values():
+            one.M[:, at] = 0.0
+
     def move(self, A: FloatArray, D: FloatArray) -> None:
         """Follow a motion by its derivatives; see `transition`."""
         for one in self._of.values():
@@ -306,6 +311,13 @@ class LandmarkModes:
         """Discard all hypotheses: the pose they were computed from was wrong."""
         self.displacements.clear()
         self.restart()
+
+    def forget_states(self, rows: Sequence[slice]) -> None:
+        """Rows of the installation are of other landmarks now: no displacement has had a part in them."""
+        for own in rows:
+            at = slice(3 + own.start, 3 + own.stop)
+            self._M[:, at] = 0.0
+            self.mounts.forget_states(at)
 
     def excludes(self, landmark_id: int) -> bool:
         """Whether sightings of this landmark are not to be used."""

@@ -124,7 +124,9 @@ class Localizer:
             self.motion.restart()
         # 6. Record
         rows = [*motion.revisions, *seen.places, *motion.decisions(frame.k), *seen.decisions, *moved]
-        return self._recorder.record(step, frame, rows, seen)
+        estimate = self._recorder.record(step, frame, rows, seen)
+        self.sightings.modes.forget_states(self.estimator.give_states())
+        return estimate
 
     def restart_at(self, pose: PoseWithCovariance) -> None:
         """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.

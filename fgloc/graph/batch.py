@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -209,6 +210,18 @@ def ground_covs(marginals: Solved, frames: Sequence[Keyframe]) -> FloatArray:
         found.append(np.block([[np.asarray(joint.at(a, b)) for b in keys] for a in keys]))
         forget_separators(marginals, row)
     return np.array(found)
+
+
+_MOST_STATES = 100  # landmarks of a map that are states over the whole run
+
+
+def of_whole_run(log: MeasurementLog, factors: LandmarkFactors) -> LandmarkFactors:
+    """The factors with those landmarks as states that were seen most; of a map that has few, as they are."""
+    if not factors.installation.stateless:
+        return factors
+    seen = Counter(s.measurement.landmark_id for frame in log.keyframes.values() for s in frame.sightings)
+    known = {*factors.installation.landmarks, *factors.installation.stateless}
+    return factors.with_states([i for i, _ in seen.most_common() if i in known][:_MOST_STATES])
 
 
 # --- The smoother -----------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from fgloc.graph.factors import (
     sighting_factors,
 )
 from fgloc.graph.ground import ground_factors, ground_prior, is_level_known, levelled, predict, starting, step_of
-from fgloc.graph.installation import GROUND, Installation, InstallationEstimate, installation_of
+from fgloc.graph.installation import GROUND, VACANT_SIGMA, Installation, InstallationEstimate, installation_of
 from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov, split
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
@@ -65,6 +65,7 @@ class Estimator(ABC):
         self._corrected = -1  # the keyframe that was corrected last: those before it lead elsewhere
         self._elapsed_s = 0.0
         self.contradicted: dict[str, tuple[float, float]] = {}
+        self._last_seen: dict[int, None] = {}  # landmarks of a map that has more than can be states, in this order
 
     @property
     def elapsed_s(self) -> float:
@@ -178,6 +179,56 @@ class Estimator(ABC):
         newest.belief, self._corrected = belief, self._k
         self._begin_at(newest)
         self._adopt(newest.belief)
+
+    def give_states(self) -> list[slice]:
+        """Make states of the landmarks of the newest keyframe that are none, in place of those not seen for longest.
+
+        Their sightings so far had the sigma of the map as noise. What was known of the others' places is forgotten,
+        and the newest belief begins a new window. A third of the states is vacated at a time, so that this is rare.
+
+        Returns:
+            Rows of the installation that are now of other landmarks.
+        """
+        installation, newest = self.installation, self.newest
+        if not installation.stateless or newest.prior is not None:
+            return []
+        here = dict.fromkeys(s.measurement.landmark_id for s in newest.sightings)
+        before = dict.fromkeys([*(installation.landmarks.keys() - self._last_seen.keys()), *self._last_seen])
+        self._last_seen = dict.fromkeys([*(i for i in before if i not in here and i in installation.landmarks), *here])
+        wanted = [i for i in here if i in installation.stateless]
+        missing, gone = len(wanted) - installation.vacancies, []
+        if missing > 0 and self._config.kind != "isam2":
+            idle = [i for i in self._last_seen if i not in here]
+            gone = idle[: max(missing, len(installation.landmarks) // 3)]
+        rows = [installation.vacate(i) for i in gone]
+        rows += [installation.occupy(i) for i in wanted[: installation.vacancies]]
+        if not rows:
+            return []
+        self.factors.states_changed()
+        newest.belief = self._forgetful(newest.belief, rows)
+        if gone:
+            self._corrected = self._k
+            self._begin_at(newest)
+        else:
+            self._add_prior(rows)
+        self._adopt(newest.belief)
+        return rows
+
+    def _forgetful(self, belief: PoseWithCovariance, rows: Sequence[slice]) -> PoseWithCovariance:
+        """The belief with nothing but their prior known of these rows of the installation."""
+        known, prior = belief.installation or self.installed, self.installation.prior()
+        mean, cov = known.mean.copy(), known.cov.copy()
+        cross = None if belief.cross is None else belief.cross.copy()
+        for own in rows:
+            mean[own], cov[own], cov[:, own] = prior.mean[own], 0.0, 0.0
+            cov[own, own] = prior.cov[own, own]
+            if cross is not None:
+                cross[:, own] = 0.0
+        return PoseWithCovariance(belief.pose, belief.cov, cross, InstallationEstimate(mean, cov))
+
+    @abstractmethod
+    def _add_prior(self, rows: Sequence[slice]) -> None:
+        """Tell the graph, if there is one, the prior of rows that were vacant."""
 
     @abstractmethod
     def _begin_at(self, newest: Keyframe) -> None:
@@ -321,6 +372,9 @@ class ExtendedKalmanFilter(Estimator):
 
     def _begin_at(self, newest: Keyframe) -> None:
         """Do nothing: a filter holds no earlier keyframes."""
+
+    def _add_prior(self, rows: Sequence[slice]) -> None:
+        """Do nothing: the belief has it."""
 
 
 # --- The two smoothers of GTSAM behind one interface ------------------------------------------------------------------
@@ -568,6 +622,17 @@ class IncrementalEstimator(Estimator):
         values.insert(INSTALLATION, self.installation.prior().mean[:constants])
         graph.add(linear_factor({INSTALLATION: H}, np.zeros(len(rows)), values))
         return graph
+
+    def _add_prior(self, rows: Sequence[slice]) -> None:
+        assert self._backend is not None
+        graph, prior, values = gtsam.NonlinearFactorGraph(), self.installation.prior(), gtsam.Values()
+        values.insert(INSTALLATION, prior.mean[: self.installation.constants])
+        for own in rows:
+            more = np.linalg.inv(prior.cov[own, own]) - np.eye(own.stop - own.start) / VACANT_SIGMA**2
+            H = np.zeros((len(more), self.installation.constants))
+            H[:, own] = np.linalg.cholesky(more).T
+            graph.add(linear_factor({INSTALLATION: H}, np.zeros(len(more)), values))
+        self._backend.hold(graph)
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import is_not
 from typing import Any
 
@@ -233,6 +233,18 @@ class LandmarkFactors:
         other._prepared = (), None
         return other
 
+    def with_states(self, ids: Iterable[int]) -> LandmarkFactors:
+        """Copy in which these landmarks are states, from the map on; the other constants start as they are known."""
+        installation = self.installation.with_states(ids)
+        other = copy.copy(self)
+        other.installation, other._prepared = installation, ((), None)
+        known = installation.prior()
+        for i, name in enumerate(self.installation.names):
+            if not name.startswith("map."):
+                known.mean[installation.index[name]] = self._estimated.mean[i]
+        other.estimated = known
+        return other
+
     @property
     def estimated(self) -> InstallationEstimate:
         """Newest estimate of the installation, with its covariance."""
@@ -242,6 +254,10 @@ class LandmarkFactors:
     def estimated(self, belief: InstallationEstimate) -> None:
         self._estimated = belief
         self._remembered = _NOTHING
+
+    def states_changed(self) -> None:
+        """Forget what was prepared for other landmarks as states."""
+        self._prepared, self._remembered = ((), None), _NOTHING
 
     def time_offset_s(self, camera: str = "") -> float:
         """How late stamps of sightings are, as far as is known; of several cameras those of one."""

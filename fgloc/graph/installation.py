@@ -8,6 +8,7 @@ through the joint covariance of pose and θ.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +26,7 @@ SENSOR = ("range_scale", "bearing_offset_rad", "time_offset_s")
 PLACE = ("x_m", "y_m")  # of that sensor in the base frame, where it may be off: behind the others in its block
 MARKER = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 POINT = ("x_m", "y_m")
+VACANT, VACANT_SIGMA = "vacant", 10.0  # rows that no landmark has now; their sigma [m, rad] is that of anything
 GROUND = ("ground.z_m", "ground.roll_rad", "ground.pitch_rad")
 LENGTH, HEADING, TURN = "length", "heading", "turn"
 # What constants of sightings change alike: distances, the direction of landmarks while the robot turns, the turn
@@ -44,6 +46,11 @@ def camera_block(name: str) -> str:
     return f"cameras.{name}" if name else "camera"
 
 
+def is_vacant(name: str) -> bool:
+    """Whether a parameter of this name belongs to no landmark now."""
+    return name.startswith(f"map.{VACANT}")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class InstallationEstimate:
     """Mean ``(n,)`` and covariance ``(n, n)`` of the installation state."""
@@ -58,11 +65,15 @@ class Installation:
     Camera translation and rotation are right perturbations in the optical frame (x right, y down, z forward); a
     marker's translation is in the map frame, its rotation in its own.
 
+    A map may have more landmarks than can be states. Then those seen last are: each takes `VACANT` rows, which are
+    there from the start, and gives them up again (`occupy`, `vacate`). The others are `stateless`.
+
     Attributes:
         names: ``section.parameter``, of markers ``map.ID.parameter``, of several cameras ``cameras.NAME.parameter``.
         sigmas: ``(n,)`` of the prior.
         blocks: rows ``(first, count)`` of `camera_block` and "sightings", where there are such.
         landmarks: likewise, by id; 6 rows for a marker seen by its corners, else 2.
+        stateless: prior covariance of the places of landmarks that are no states now, ``(6, 6)`` or ``(2, 2)``, by id.
         ground: on uneven ground the last three rows are `GROUND`: height, roll and pitch of the base. They are of the
             newest pose; in the graph each keyframe has its own.
         effects: what a constant changes; constants of one effect may be taken for one another.
@@ -97,9 +108,13 @@ class Installation:
         self.index = {name: i for i, name in enumerate(self.names)}
         self.blocks: dict[str, tuple[int, int]] = {}
         self.landmarks: dict[int, tuple[int, int]] = {}
+        self.stateless: dict[int, FloatArray] = {}
+        self._vacant: list[int] = []
         for i, name in enumerate(self.names):
             section, *rest = name.split(".")
-            if section == "map":
+            if section == "map" and rest[0].startswith(VACANT):
+                self._vacant += [i] if rest[1] == POINT[0] else []
+            elif section == "map":
                 first, count = self.landmarks.get(int(rest[0]), (i, 0))
                 self.landmarks[int(rest[0])] = (first, count + 1)
             elif section in _SENSORS:
@@ -123,10 +138,70 @@ class Installation:
     @cached_property
     def motion_rows(self) -> IntArray:
         """Rows of the parameters that belong neither to landmarks nor to the sensor that sees them."""
-        of_sightings = {
-            first + i for first, count in (*self.blocks.values(), *self.landmarks.values()) for i in range(count)
+        of_sensors = {first + i for first, count in self.blocks.values() for i in range(count)}
+        return np.array(
+            [i for i, name in enumerate(self.names) if i not in of_sensors and not name.startswith("map.")],
+            dtype=np.int64,
+        )
+
+    @property
+    def vacancies(self) -> int:
+        """How many more landmarks can become states."""
+        return len(self._vacant)
+
+    def occupy(self, landmark_id: int) -> slice:
+        """Make a stateless landmark a state, in vacant rows.
+
+        Returns:
+            The rows; their prior is that of the landmark now.
+        """
+        cov, first = self.stateless.pop(landmark_id), self._vacant.pop()
+        rows = slice(first, first + len(cov))
+        self.landmarks[landmark_id] = first, len(cov)
+        self._rename(rows, (f"map.{landmark_id}.{name}" for name in (MARKER if len(cov) > len(POINT) else POINT)))
+        self._prior_cov[rows, rows] = cov
+        self.sigmas[rows] = np.sqrt(np.diag(cov))
+        return rows
+
+    def vacate(self, landmark_id: int) -> slice:
+        """Make a landmark stateless again.
+
+        Returns:
+            Its rows; their prior is that of vacant ones now.
+        """
+        first, count = self.landmarks.pop(landmark_id)
+        rows = slice(first, first + count)
+        self.stateless[landmark_id] = self._prior_cov[rows, rows].copy()
+        self._rename(rows, (f"map.{VACANT}{first}.{name}" for name in MARKER))
+        self._prior_cov[rows, rows] = VACANT_SIGMA**2 * np.eye(count)
+        self.sigmas[rows] = VACANT_SIGMA
+        self._vacant.append(first)
+        return rows
+
+    def _rename(self, rows: slice, names: Iterable[str]) -> None:
+        changed = list(self.names)
+        changed[rows] = [name for name, _ in zip(names, changed[rows], strict=False)]
+        self.names = tuple(changed)
+        self.index = {name: i for i, name in enumerate(self.names)}
+
+    def with_states(self, ids: Iterable[int]) -> Installation:
+        """Copy in which just these landmarks are states, and no rows are vacant."""
+        kept = [i for i, name in enumerate(self.names) if not name.startswith("map.")]
+        covs = {i: self._prior_cov[f : f + n, f : f + n] for i, (f, n) in self.landmarks.items()} | self.stateless
+        chosen = {i: covs[i] for i in sorted(ids)}
+        own = {self.names[i]: float(self.sigmas[i]) for i in kept}
+        ground = {name: own.pop(name) for name in GROUND if name in own}
+        places = {
+            f"map.{i}.{name}": math.sqrt(v)
+            for i, cov in chosen.items()
+            for name, v in zip(MARKER, np.diag(cov).tolist(), strict=False)
         }
-        return np.array([i for i in range(len(self)) if i not in of_sightings], dtype=np.int64)
+        other = Installation(own | places | ground, chosen, self.effects, self.length)
+        rows = [other.index[self.names[i]] for i in kept]
+        other._prior_cov[np.ix_(rows, rows)] = self._prior_cov[np.ix_(kept, kept)]
+        other._prior_mean[rows] = self._prior_mean[kept]
+        other.stateless = {i: cov for i, cov in covs.items() if i not in chosen}
+        return other
 
     def prior(self) -> InstallationEstimate:
         """Mean and covariance of the installation before any measurement."""
@@ -209,7 +284,7 @@ def _block(name: str) -> str:
 
 _UNSEEN = 1e-6  # share of its variance by which measurements make a constant surer that they say nothing of
 _HELD = 1e-5  # sigma of a parameter that is taken as exact although its block is a state
-MOST_LANDMARKS = 60  # that are states, to bound the work of a step; of a larger map one fewer for each further one
+MOST_LANDMARKS = 40  # that are states at a time, to bound the work of a step
 
 
 def installation_of(
@@ -232,8 +307,7 @@ def installation_of(
         landmark_map: the known map; None: landmarks are variables of their own, only motion has parameters here.
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
-        most: landmarks of a map that are states. Of a larger map one fewer for each landmark more, and from twice as
-            many on none: the others are taken as exact. The worst known ones are states.
+        most: landmarks of a map that are states at a time; of a larger map those that are seen (`Installation.occupy`).
         has_model: whether there is a learned motion.
         sensed: parameters of registered sensors.
         cameras: names of the cameras that see corners.
@@ -263,23 +337,31 @@ def installation_of(
         if rb.position_sigma_m > 0.0:
             sigmas |= {f"sightings.{name}": rb.position_sigma_m for name in PLACE}
     by_id = dict(sorted(landmark_map.landmarks.items()))
-    worst = sorted(by_id.values(), key=lambda one: -_variance(one, config))
-    states = {one.landmark_id for one in worst[: min(len(worst), max(2 * most - len(worst), 0))]}
-    for i in (i for i in by_id if i in states):
-        sigmas |= _landmark_sigmas(i, by_id[i], config, corners)
-    sigmas |= ground
-    return Installation(
-        sigmas, {i: m.cov for i, m in landmark_map.landmarks.items() if m.cov is not None}, effects, length
-    )
+    places = {i: _landmark_sigmas(landmark, config, corners) for i, landmark in by_id.items()}
+    given = {i: landmark.cov for i, landmark in by_id.items() if landmark.cov is not None}
+    if len(by_id) <= most:
+        sigmas |= {f"map.{i}.{name}": v for i, place in places.items() for name, v in place.items()}
+        return Installation(sigmas | ground, given, effects, length)
+    largest = MARKER if any(len(place) > len(POINT) for place in places.values()) else POINT
+    sigmas |= {f"map.{VACANT}{slot}.{name}": VACANT_SIGMA for slot in range(most) for name in largest}
+    made = Installation(sigmas | ground, None, effects, length)
+    made.stateless = {
+        i: _prior(place, given.get(i)) for i, place in places.items() if i in given or any(place.values())
+    }
+    return made
 
 
-def _variance(landmark: Landmark, config: Config) -> float:
-    """Prior variance of a landmark's place in the plane [m²]."""
-    return 2.0 * config.map.position_sigma_m**2 if landmark.cov is None else float(landmark.cov[:2, :2].trace())
-
-
-def _landmark_sigmas(i: int, landmark: Landmark, config: Config, corners: bool) -> dict[str, float]:
+def _landmark_sigmas(landmark: Landmark, config: Config, corners: bool) -> dict[str, float]:
     m, r = config.map.position_sigma_m, config.map.rotation_sigma_rad
     if corners and landmark.size_m > 0.0:
-        return {f"map.{i}.{name}": v for name, v in zip(MARKER, (m, m, m, r, r, r), strict=True)}
-    return {f"map.{i}.{name}": m for name in POINT}
+        return dict(zip(MARKER, (m, m, m, r, r, r), strict=True))
+    return dict.fromkeys(POINT, m)
+
+
+def _prior(place: Mapping[str, float], given: FloatArray | None) -> FloatArray:
+    """Covariance of a landmark's place by these sigmas, where the map does not give it."""
+    cov = np.diag(np.maximum(list(place.values()), _HELD) ** 2)
+    if given is not None:
+        n = min(len(cov), len(given))
+        cov[:n, :n] = given[:n, :n]
+    return cov

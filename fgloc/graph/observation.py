@@ -65,6 +65,8 @@ class Stacked:
         columns: see above.
         behind: ``(m,)`` whether a corner is behind the camera.
         by_tilt: ``(m, d, 2)`` by roll and pitch of the base; None: they are states, or nothing depends on them.
+        whitening: ``(m, d, d)`` by which all of these were multiplied, as the landmark's place is noise too; None: of
+            none it is.
     """
 
     residual: FloatArray
@@ -73,6 +75,18 @@ class Stacked:
     columns: IntArray
     behind: NDArray[np.bool_]
     by_tilt: FloatArray | None = None
+    whitening: FloatArray | None = None
+
+    def with_noise(self, by_landmark: FloatArray | None) -> Stacked:
+        """The same with noise of the landmark's place, whose square root ``(m, d, s)`` this is; None: there is none."""
+        if by_landmark is None:
+            return self
+        values, vectors = np.linalg.eigh(by_landmark @ np.swapaxes(by_landmark, 1, 2))
+        scaled = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))[:, None, :]
+        W = scaled @ np.swapaxes(vectors, 1, 2)
+        residual = (W @ self.residual[..., None])[..., 0]
+        by_tilt = None if self.by_tilt is None else W @ self.by_tilt
+        return Stacked(residual, W @ self.J, W @ self.H, self.columns, self.behind, by_tilt, W)
 
 
 class Batch(Protocol):
@@ -103,6 +117,19 @@ def landmark_block(installation: Installation, landmark_id: int, rows: int) -> i
     """First row of a landmark's state, if that has at least ``rows``; else -1."""
     first, count = installation.landmarks.get(landmark_id, (-1, 0))
     return first if count >= rows else -1
+
+
+def place_roots(installation: Installation, ids: Sequence[int], size: int) -> FloatArray | None:
+    """Square roots ``(m, size, size)`` of the covariances of places that are no states; 0 of others, None: of all."""
+    if not any(i in installation.stateless for i in ids):
+        return None
+    roots = np.zeros((len(ids), size, size))
+    for root, i in zip(roots, ids, strict=True):
+        cov = installation.stateless.get(i)
+        if cov is not None:
+            n = min(size, len(cov))
+            root[:n, :n] = np.linalg.cholesky(cov[:n, :n])
+    return roots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,6 +239,7 @@ class CornerBatch:
         self._columns[:, :12] = self._camera
         self._columns[:, 12:] = np.where(marker[:, None] >= 0, marker[:, None] + np.arange(6), -1)
         self._constants = installation.constants
+        self._roots = place_roots(installation, [m.landmark_id for m in seen], 6)
 
     def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
         """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time.
@@ -261,8 +289,12 @@ class CornerBatch:
         if tilt is not None:
             J = _by_tilted_pose(B, q, tilt, poses[:, 4])
         J = (J * scale[:, None, None, None]).reshape(n, 8, -1)
+        by_place = None
+        if self._roots is not None:
+            M = self._marker(B @ Rz.transpose(0, 2, 1)[:, None], local) * scale[:, None, None, None]
+            by_place = M.reshape(n, 8, 6) @ self._roots
         if not by_installation:
-            return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind)
+            return Stacked(residual, J, np.zeros((n, 8, 0)), self._columns, behind).with_noise(by_place)
         assert by_lens is not None
         H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
@@ -273,9 +305,11 @@ class CornerBatch:
         if self._tilting is None:
             about = (H[..., 3:6] @ self._R.transpose(0, 2, 1)[:, None])[..., :2]
             by_tilt = (about * scale[:, None, None, None]).reshape(n, 8, 2)
-        self._by_marker(H, B @ Rz.transpose(0, 2, 1)[:, None], local)
+        H[..., 12:] = self._marker(B @ Rz.transpose(0, 2, 1)[:, None], local)
+        H[..., :12] *= (self._camera[:, 0] >= 0)[:, None, None, None]
+        H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
         H = (H * scale[:, None, None, None]).reshape(n, 8, 18)
-        return Stacked(residual, J, H, self._columns, behind, by_tilt)
+        return Stacked(residual, J, H, self._columns, behind, by_tilt).with_noise(by_place)
 
     def _flow(self, q: FloatArray) -> FloatArray:
         """How points ``(m, 4, 3)`` in the base frame move by a later stamp [m/s]."""
@@ -284,12 +318,9 @@ class CornerBatch:
         flow[:, :, 1] = self._twist[:, None, 1] + self._twist[:, None, 2] * q[:, :, 0]
         return flow if self._tilting is None else flow + _cross(self._tilting[:, None], q)
 
-    def _by_marker(self, H: FloatArray, M: FloatArray, local: FloatArray) -> None:
-        """Fill in derivatives by the marker, from those by a point in the map ``(m, 4, 2, 3)``; 0 what is no state."""
-        H[..., 12:15] = M
-        H[..., 15:] = -_crossed(M @ self._rotation[:, None], local)
-        H[..., :12] *= (self._camera[:, 0] >= 0)[:, None, None, None]
-        H[..., 12:] *= (self._columns[:, 12] >= 0)[:, None, None, None]
+    def _marker(self, M: FloatArray, local: FloatArray) -> FloatArray:
+        """Derivatives ``(m, 4, 2, 6)`` by the marker's place, from those by a point in the map ``(m, 4, 2, 3)``."""
+        return np.concatenate([M, -_crossed(M @ self._rotation[:, None], local)], axis=3)
 
     def _ground_in_installation(self, stack: Stacked, by_installation: bool) -> Stacked:
         """Derivatives by height, roll and pitch as the last ones by the installation."""
@@ -299,7 +330,7 @@ class CornerBatch:
             H = np.concatenate([H, stack.J[:, :, 3:]], axis=2)
             last = np.broadcast_to(self._constants + np.arange(3), (n, 3))
             columns = np.concatenate([columns, last], axis=1)
-        return Stacked(stack.residual, J, H, columns, stack.behind)
+        return Stacked(stack.residual, J, H, columns, stack.behind, None, stack.whitening)
 
     def _project(
         self, X: FloatArray, camera: FloatArray, with_lens: bool
@@ -360,6 +391,8 @@ class CornerBatch:
     def shared_all(self, stack: Stacked) -> FloatArray:
         """`shared` of all sightings ``(m, 8, s)``; columns that one lacks are 0."""
         shrunk = self._outward * (self._small * self._blur_px / self._noise_px)[:, None]
+        if stack.whitening is not None:
+            shrunk = (stack.whitening @ shrunk[..., None])[..., 0]
         jitter = self._jitter[:, None] * stack.H[:, :, 11]
         common = np.stack([shrunk, jitter], axis=2)
         if stack.by_tilt is not None:
@@ -372,6 +405,8 @@ class CornerBatch:
     def shared(self, i: int, stack: Stacked) -> FloatArray:
         """Square root ``(8, s)`` of the covariance that sighting ``i`` shares with its image, see `Linearized`."""
         shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
+        if stack.whitening is not None:
+            shrunk = stack.whitening[i] @ shrunk
         common = [shrunk, self._jitter[i] * stack.H[i, :, 11:12]]
         if stack.by_tilt is not None:
             common.append(self._sway[i] * stack.by_tilt[i])
@@ -494,6 +529,7 @@ class PlanarBatch:
         self._columns[:, :5] = self._sensor
         self._columns[:, 5:7] = np.where(place[:, None] >= 0, place[:, None] + np.arange(2), -1)
         self._columns[:, 7:] = np.where(turn[:, None] >= 0, turn[:, None] + np.arange(3, 6), -1)
+        self._roots = place_roots(installation, [m.landmark_id for m in seen], 2)
 
     def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
         """All sightings, each at its own pose ``(m, 3)``; without derivatives by the installation in half the time."""
@@ -532,7 +568,8 @@ class PlanarBatch:
         H[:, :, 2], H[:, :2, 5:7], H[:, 2, 7:] = flow, turn @ R, self._up
         H = np.where(self._columns[:, None] >= 0, H, 0.0)
         W = self._whitening
-        return Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))
+        made = Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))
+        return made if self._roots is None else made.with_noise(W[:, :, :2] @ turn @ R @ self._roots)
 
     def shared_all(self, stack: Stacked) -> FloatArray:
         """`shared` of all sightings ``(m, 3, 0)``."""

@@ -28,9 +28,9 @@ from fgloc.live.state import (
     RunState,
     carried_over,
     fingerprint,
-    installation_of_state,
     matrix3,
     odometry_state,
+    resumed_installation,
     row3,
 )
 from fgloc.recording.transforms import FrameTree
@@ -406,7 +406,7 @@ class OnlineRun:
     def _take_over(self, parts: Assembly, state: RunState) -> None:
         """Start from the state of an earlier run, but for its pose, which waits for the first step."""
         localizer, gyro = parts.localizer, parts.localizer.motion.sources.gyro
-        known = installation_of_state(state, localizer.factors.installation)
+        known = resumed_installation(state.installation, localizer.factors.installation)
         if known is not None:
             localizer.factors.estimated = known
         if gyro is not None and state.gyro is not None:

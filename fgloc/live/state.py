@@ -18,7 +18,7 @@ from fgloc.config import Config, Section
 from fgloc.errors import FglocError, OutputError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import read_text
-from fgloc.graph.installation import Installation, InstallationEstimate
+from fgloc.graph.installation import GROUND, Installation, InstallationEstimate, is_vacant
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.types import FloatArray, LandmarkMap, Mode, MotionEvent, Step
 
@@ -126,16 +126,21 @@ def read_state(path: Path, map_fingerprint: str, remedy: str = _FRESH) -> Resume
     return Resumed(state, "")
 
 
-def installation_of_state(state: RunState, installation: Installation) -> InstallationEstimate | None:
+def resumed_installation(saved: InstallationState, installation: Installation) -> InstallationEstimate | None:
     """Saved estimate of the installation, but for the ground; None if the parameters are not the same."""
-    saved = state.installation
-    if saved.names != installation.names or not saved.names:
+    for name in saved.names:  # of a map of which some landmarks are states: those that were
+        section, _, rest = name.partition(".")
+        landmark_id = rest.partition(".")[0]
+        if section == "map" and landmark_id.lstrip("-").isdecimal() and int(landmark_id) in installation.stateless:
+            installation.occupy(int(landmark_id))
+    at = {name: i for i, name in enumerate(saved.names) if name not in GROUND and not is_vacant(name)}
+    here = {name: i for i, name in enumerate(installation.names[: installation.constants]) if not is_vacant(name)}
+    if not at or at.keys() != here.keys():
         return None
-    prior, constants = installation.prior(), installation.constants
-    mean, cov = prior.mean, prior.cov
-    mean[:constants] = saved.mean[:constants]
-    cov[:constants, :constants] = np.array(saved.cov)[:constants, :constants]
-    return InstallationEstimate(mean, cov)
+    prior, rows, to = installation.prior(), [at[name] for name in here], list(here.values())
+    prior.mean[to] = np.array(saved.mean)[rows]
+    prior.cov[np.ix_(to, to)] = np.array(saved.cov)[np.ix_(rows, rows)]
+    return prior
 
 
 def matrix3(cov: FloatArray) -> tuple[Row3, Row3, Row3]:

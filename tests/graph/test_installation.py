@@ -30,7 +30,7 @@ from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.estimators import ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import predict
-from fgloc.graph.installation import MOST_LANDMARKS, Installation, InstallationEstimate, installation_of
+from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
 from fgloc.graph.joint import correct, fuse_installed, joint_cov
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors
@@ -50,21 +50,6 @@ def test_parameters_of_sigma_zero_are_no_states():
     assert made.names == ("wheels.radius",)
     assert len(Installation({})) == 0
     assert Installation({}).time_offset(Installation({}).prior()) == 0.0
-
-
-def test_a_landmark_more_takes_the_state_of_one_landmark():
-    def states(n):
-        loose = np.diag([0.3, 0.3]) ** 2
-        landmarks = [
-            Landmark(i, np.array([i, 0.0, 0.0]), np.eye(3), 0.0, loose if i == n - 1 else None) for i in range(n)
-        ]
-        return installation_of(config(), LandmarkMap({one.landmark_id: one for one in landmarks}), False).landmarks
-
-    counts = [len(states(n)) for n in range(1, 3 * MOST_LANDMARKS)]
-    assert max(counts) == MOST_LANDMARKS
-    assert np.abs(np.diff(counts)).max() == 1
-    assert counts[-1] == 0
-    assert 99 in states(100)  # the worst known is the last that goes
 
 
 def test_in_a_block_that_holds_others_a_parameter_of_sigma_zero_is_held():
@@ -97,8 +82,6 @@ def test_what_is_a_state_depends_on_the_sensors():
     assert not any(
         "." in n and n.split(".")[0] in ("map", "camera") for n in installation_of(config(), None, True).names
     )
-    many = beacons(2 * MOST_LANDMARKS)
-    assert not installation_of(config(), many, False).landmarks
 
 
 # --- prediction and correction against a dense Gaussian ---------------------------------------------------------------

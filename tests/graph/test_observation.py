@@ -176,6 +176,27 @@ def test_a_marker_in_a_map_whose_states_are_six_turns_with_its_yaw():
     )
 
 
+@pytest.mark.parametrize("corners", [True, False])
+def test_a_place_that_is_no_state_is_noise_of_its_sighting(corners):
+    """The sighting tells the pose as much as with the place as a state whose prior it has."""
+    poses, landmark_map, seen = scene(0) if corners else planar_scene(0)
+    if corners:
+        seen = [replace(m, jitter_s=0.004, sway_rad=0.005, blur_s=0.001) for m in seen]
+    states, none = (installation_of(config(), landmark_map, corners, most=most) for most in (99, 0))
+    assert not none.landmarks
+    each = [
+        Observations(seen, landmark_map.landmarks, made).linearize(poses, np.zeros(len(made)))
+        for made in (states, none)
+    ]
+    for known, noise in zip(*each, strict=True):
+        own = [i for i, column in enumerate(known.columns) if states.names[column].startswith("map.")]
+        prior = states.prior().cov[np.ix_(known.columns[own], known.columns[own])]
+        cov = known.noise() + known.H[:, own] @ prior @ known.H[:, own].T
+        for a, b in ((known.J, noise.J), (known.residual, noise.residual), (known.H[:, :3], noise.H[:, :3])):
+            weighed = known.J.T @ np.linalg.solve(cov, a)
+            assert noise.J.T @ np.linalg.solve(noise.noise(), b) == pytest.approx(weighed, rel=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_residual_of_corners_is_that_of_gtsam(seed):
     poses, landmark_map, seen = scene(seed)
