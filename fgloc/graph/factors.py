@@ -25,6 +25,7 @@ from fgloc.graph.observation import Lines, Observations
 from fgloc.sensors.measurements import FrameMeasurement, LandmarkMeasurement, PointMeasurement
 from fgloc.types import (
     FloatArray,
+    IntArray,
     Landmark,
     LandmarkMap,
     MotionMeasurement,
@@ -220,6 +221,7 @@ class LandmarkFactors:
         self.installation = Installation({}) if installation is None else installation
         self._estimated = self.installation.prior()
         self._prepared: tuple[tuple[LandmarkMeasurement, ...], Observations | None] = (), None
+        self._sizes: dict[float, tuple[IntArray, FloatArray]] = {}
         self._remembered: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, int]], Lines] = _NOTHING
 
     def with_installation(self, installation: Installation) -> LandmarkFactors:
@@ -323,17 +325,22 @@ class LandmarkFactors:
             raise EstimatorError("what else a marker may be needs a known map")
         if not m.in_pixels:
             return ()
-        size = self._known[m.landmark_id].size_m
-        others = [x for i, x in self._known.items() if i != m.landmark_id and x.size_m == size]
+        ids, positions = self._of_size(self._known[m.landmark_id].size_m)
         x, y, yaw = pose
         c, s = math.cos(yaw), math.sin(yaw)
-        places = []
-        for other in others:
-            dx, dy = other.position[0] - x, other.position[1] - y
-            base = self._tilted(np.array([[c * dx + s * dy, -s * dx + c * dy, other.position[2]]]))[0]
-            places.append((other.landmark_id, base))
-        found = m.misread(places)
+        dx, dy = positions[:, 0] - x, positions[:, 1] - y
+        places = self._tilted(np.column_stack([c * dx + s * dy, -s * dx + c * dy, positions[:, 2]]))
+        others = ids != m.landmark_id
+        found = m.misread(ids[others], places[others])
         return found if len(found) <= _MOST_LOOKALIKES else ()
+
+    def _of_size(self, size_m: float) -> tuple[IntArray, FloatArray]:
+        """Ids ``(n,)`` and positions ``(n, 3)`` of the markers of a size."""
+        if size_m not in self._sizes:
+            held = [one for one in self.landmarks.values() if one.size_m == size_m]
+            ids = np.array([one.landmark_id for one in held], dtype=np.int64)
+            self._sizes[size_m] = ids, np.array([one.position for one in held])
+        return self._sizes[size_m]
 
     def _tilted(self, level: FloatArray) -> FloatArray:
         """Points ``(m, 3)`` in the base's axes, from those of a level base on the floor."""

@@ -20,7 +20,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import camera_role
 from fgloc.sensors.cameras import marker_pose_candidates, planar_base_candidates
-from fgloc.types import Camera, FloatArray, Landmark
+from fgloc.types import Camera, FloatArray, IntArray, Landmark
 
 MIN_DEPTH_M = 0.05  # a corner nearer to the image plane than this is not projected
 UNNAMED = -1  # landmark of a sighting that does not say of which it is
@@ -182,11 +182,12 @@ class LandmarkMeasurement(Protocol):
         """
         ...
 
-    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
         """The measurement as one of other landmarks, of each that lies about where it was seen.
 
         Args:
-            others: ids, and places ``(3,)`` in the axes of the base.
+            ids: ``(n,)`` of those that it may be.
+            places: ``(n, 3)`` theirs in the axes of the base.
         """
         ...
 
@@ -300,19 +301,15 @@ class PixelMeasurement:
         """No alternatives but other ids; see `misread`."""
         return ()
 
-    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> list[PixelMeasurement]:
+    def misread(self, ids: IntArray, places: FloatArray) -> list[PixelMeasurement]:
         """The same corners with other ids, of markers whose middle lies in about the same direction."""
         T, K = self.camera.T_base_cam, self.camera.K
         u, v = self.corners_px.mean(axis=0)
-        found = []
-        for landmark_id, place in others:
-            right, down, depth = T[:3, :3].T @ (place - T[:3, 3])
-            if depth < MIN_DEPTH_M:
-                continue
-            across = math.hypot(right / depth - (u - K[0, 2]) / K[0, 0], down / depth - (v - K[1, 2]) / K[1, 1])
-            if across < _LOOKALIKE:
-                found.append(replace(self, landmark_id=landmark_id))
-        return found
+        right, down, depth = ((places - T[:3, 3]) @ T[:3, :3]).T
+        ahead = depth >= MIN_DEPTH_M
+        right, down = right[ahead] / depth[ahead], down[ahead] / depth[ahead]
+        across = np.hypot(right - (u - K[0, 2]) / K[0, 0], down - (v - K[1, 2]) / K[1, 1])
+        return [replace(self, landmark_id=i) for i in ids[ahead][across < _LOOKALIKE].tolist()]
 
     def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
         """Place of the marker in the camera, by the better of its two poses; see `LandmarkSighting.relative`."""
@@ -425,7 +422,7 @@ class PointMeasurement:
         """No alternatives."""
         return ()
 
-    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
         """No other readings: the sensor's own association is taken as it is."""
         return ()
 
@@ -540,7 +537,7 @@ class FrameMeasurement:
         """No alternatives."""
         return ()
 
-    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
         """No other readings: the detector's association is taken as it is."""
         return ()
 
@@ -673,7 +670,7 @@ class PoseMeasurement(ABC):
         """None: it is of no landmark."""
         return None
 
-    def misread(self, others: Sequence[tuple[int, FloatArray]]) -> Sequence[LandmarkMeasurement]:
+    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
         """No other readings; see `alternatives`."""
         return ()
 
