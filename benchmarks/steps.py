@@ -5,6 +5,8 @@ A robot sways before a wall with four markers in view, 20 images a second, odome
 ``online.fuse_over_gtsam`` gives each step's own factors, ready made, to a plain ``IncrementalFixedLagSmoother`` in the
 same process, which also returns pose and covariance; our side of the ratio includes making the factors.
 ``online.update_over_gtsam`` has the whole update on our side: from a step's events to its estimate, in processor time.
+``map60.over_map4``, ``map5000.over_map60``: processor time of an update, median, with so many markers in the map and
+the same four in view; the maps take turns.
 Beside the wall time of updates stands the processor's (``cpu``): on a shared machine the tail of the former is that of
 the scheduler. The motion model is of another robot, as happens; it is found out in the first seconds.
 """
@@ -55,15 +57,18 @@ def measure(quick: bool) -> Iterator[Row]:
     minutes = 2 if quick else 60
     yield from _detection()
     yield from _phases_and_ratio(60 if quick else 300)
+    yield from _maps(20 if quick else 100)
     yield from _long_run(minutes)
 
 
 class World:
     """Events of the swaying robot, made as they are asked for."""
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0, markers: int = 4) -> None:
         self._rng = np.random.default_rng(seed)
-        self.map = LandmarkMap({i: Landmark(i, np.array([4.0, -1.2 + 0.8 * i, 0.3]), _WALL, 0.2) for i in range(4)})
+        places = [(4.0, -1.2 + 0.8 * i) for i in range(4)] + [(-50.0 - i // 50, 1.0 * (i % 50)) for i in range(markers)]
+        held = [Landmark(i, np.array([*place, 0.3]), _WALL, 0.2) for i, place in enumerate(places[:markers])]
+        self.map = LandmarkMap({one.landmark_id: one for one in held})
         self.camera = Camera(640, 480, "plumb_bob", _K, np.array([0.05, -0.02, 0.001, -0.002]), _T_BASE_CAM)
 
     @staticmethod
@@ -106,7 +111,7 @@ class World:
         T_cam_map = np.linalg.inv(T_map_base @ _T_BASE_CAM)
         k1, k2, p1, p2 = self.camera.D
         seen = []
-        for landmark in self.map.landmarks.values():
+        for landmark in [self.map.landmarks[i] for i in range(4)]:
             points = landmark.corners() @ T_cam_map[:3, :3].T + T_cam_map[:3, 3]
             x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
             r2 = x * x + y * y
@@ -172,6 +177,15 @@ def _phases_and_ratio(seconds: float) -> Iterator[Row]:
     yield Row("online.fuse_over_gtsam", float(fuse.sum() / bare_wall.sum()), n=n)
     yield Row("online.fuse_over_gtsam_median", float(np.median(fuse) / np.median(bare_wall)), n=n)
     yield Row("online.update_over_gtsam", float(np.median(update) / np.median(bare_cpu)), n=n)
+
+
+def _maps(seconds: float) -> Iterator[Row]:
+    """Updates with larger maps, of which as much is in view."""
+    worlds = [World(markers=n) for n in (4, 60, 5000)]
+    runs = [Chain(world).updates(world.events(seconds)) for world in worlds]
+    small, middle, large = np.array([[cpu for _, cpu in each] for each in zip(*runs, strict=True)]).T
+    for name, a, b in (("map60.over_map4", middle, small), ("map5000.over_map60", large, middle)):
+        yield Row(name, float(np.median(a) / np.median(b)), n=len(a))
 
 
 class _Mirror:

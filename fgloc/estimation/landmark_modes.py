@@ -167,6 +167,14 @@ def _either(cost: FloatArray | float, other: FloatArray | float, prior: float) -
     return np.asarray(-2.0 * np.logaddexp(sound, slipped))
 
 
+def _with_states(M: FloatArray, added: slice, rows: Sequence[slice]) -> FloatArray:
+    """Derivatives ``(k, 3 + n, d)`` of pose and installation with rows added to the latter, and 0 of changed ones."""
+    wider = np.insert(M, [3 + added.start] * (added.stop - added.start), 0.0, axis=1)
+    for own in rows:
+        wider[:, 3 + own.start : 3 + own.stop] = 0.0
+    return wider
+
+
 class MountModes:
     """The hypotheses that the mounting of a landmark sensor is another one than the estimator takes it to be.
 
@@ -187,10 +195,11 @@ class MountModes:
         self._of.clear()
         self._taken = None
 
-    def forget_states(self, at: slice) -> None:
-        """No change of a mounting has had a part in these states."""
+    def states_changed(self, added: slice, rows: Sequence[slice]) -> None:
+        """Follow `Estimator.give_states`: no change of a mounting has had a part in new states."""
+        self._states += added.stop - added.start
         for one in self._of.values():
-            one.M[:, at] = 0.0
+            one.M = _with_states(one.M, added, rows)
 
     def move(self, A: FloatArray, D: FloatArray) -> None:
         """Follow a motion by its derivatives; see `transition`."""
@@ -312,12 +321,10 @@ class LandmarkModes:
         self.displacements.clear()
         self.restart()
 
-    def forget_states(self, rows: Sequence[slice]) -> None:
-        """Rows of the installation are of other landmarks now: no displacement has had a part in them."""
-        for own in rows:
-            at = slice(3 + own.start, 3 + own.stop)
-            self._M[:, at] = 0.0
-            self.mounts.forget_states(at)
+    def states_changed(self, added: slice, rows: Sequence[slice]) -> None:
+        """Follow `Estimator.give_states`: no displacement has had a part in new states."""
+        self._M = _with_states(self._M, added, rows)
+        self.mounts.states_changed(added, rows)
 
     def excludes(self, landmark_id: int) -> bool:
         """Whether sightings of this landmark are not to be used."""

@@ -125,7 +125,7 @@ class Localizer:
         # 6. Record
         rows = [*motion.revisions, *seen.places, *motion.decisions(frame.k), *seen.decisions, *moved]
         estimate = self._recorder.record(step, frame, rows, seen)
-        self.sightings.modes.forget_states(self.estimator.give_states())
+        self.sightings.modes.states_changed(*self.estimator.give_states())
         return estimate
 
     def restart_at(self, pose: PoseWithCovariance) -> None:

@@ -180,39 +180,43 @@ class Estimator(ABC):
         self._begin_at(newest)
         self._adopt(newest.belief)
 
-    def give_states(self) -> list[slice]:
-        """Make states of the landmarks of the newest keyframe that are none, in place of those not seen for longest.
+    def give_states(self) -> tuple[slice, list[slice]]:
+        """Make states of the landmarks of the newest keyframe that are none.
 
-        Their sightings so far had the sigma of the map as noise. What was known of the others' places is forgotten,
-        and the newest belief begins a new window. A third of the states is vacated at a time, so that this is rare.
+        Their sightings so far had the sigma of the map as noise. Where no rows are vacant, some are added; where there
+        are as many as there may be, a third of the landmarks, those not seen for longest, becomes stateless: what was
+        known of their places is forgotten. After either the newest belief begins a new window; so it is rare.
 
         Returns:
-            Rows of the installation that are now of other landmarks.
+            Rows that were added to the installation, and those that are now of other landmarks.
         """
-        installation, newest = self.installation, self.newest
+        installation, newest, added = self.installation, self.newest, slice(0, 0)
         if not installation.stateless or newest.prior is not None:
-            return []
+            return added, []
         here = dict.fromkeys(s.measurement.landmark_id for s in newest.sightings)
         before = dict.fromkeys([*(installation.landmarks.keys() - self._last_seen.keys()), *self._last_seen])
         self._last_seen = dict.fromkeys([*(i for i in before if i not in here and i in installation.landmarks), *here])
         wanted = [i for i in here if i in installation.stateless]
-        missing, gone = len(wanted) - installation.vacancies, []
-        if missing > 0 and self._config.kind != "isam2":
-            idle = [i for i in self._last_seen if i not in here]
-            gone = idle[: max(missing, len(installation.landmarks) // 3)]
+        gone: list[int] = []
+        if len(wanted) > installation.vacancies and self._config.kind != "isam2":
+            added = installation.grow()
+            if added.start == added.stop:
+                idle = [i for i in self._last_seen if i not in here]
+                gone = idle[: max(len(wanted) - installation.vacancies, len(installation.landmarks) // 3)]
         rows = [installation.vacate(i) for i in gone]
         rows += [installation.occupy(i) for i in wanted[: installation.vacancies]]
         if not rows:
-            return []
+            return added, []
         self.factors.states_changed()
-        newest.belief = self._forgetful(newest.belief, rows)
-        if gone:
+        newest.belief = self._forgetful(_wider(newest.belief, self.installed, added), rows)
+        if gone or added.stop > added.start:
             self._corrected = self._k
+            self.factors.estimated = newest.belief.installation or self.installed
             self._begin_at(newest)
         else:
             self._add_prior(rows)
         self._adopt(newest.belief)
-        return rows
+        return added, rows
 
     def _forgetful(self, belief: PoseWithCovariance, rows: Sequence[slice]) -> PoseWithCovariance:
         """The belief with nothing but their prior known of these rows of the installation."""
@@ -318,6 +322,16 @@ class Estimator(ABC):
     @abstractmethod
     def _solve(self, frame: Keyframe) -> None:
         """Replace the belief of a keyframe, which is its prior or its prediction, by the filtered one."""
+
+
+def _wider(belief: PoseWithCovariance, known: InstallationEstimate, added: slice) -> PoseWithCovariance:
+    """The belief with these rows of the installation added, of which nothing is known."""
+    known, at = belief.installation or known, [added.start] * (added.stop - added.start)
+    cov = np.insert(np.insert(known.cov, at, 0.0, axis=0), at, 0.0, axis=1)
+    cov[added, added] = VACANT_SIGMA**2 * np.eye(len(at))
+    cross = None if belief.cross is None else np.insert(belief.cross, at, 0.0, axis=1)
+    wider = InstallationEstimate(np.insert(known.mean, at, 0.0), cov)
+    return PoseWithCovariance(belief.pose, belief.cov, cross, wider)
 
 
 # --- The extended Kalman filter, to compare with ----------------------------------------------------------------------

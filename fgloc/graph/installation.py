@@ -46,6 +46,11 @@ def camera_block(name: str) -> str:
     return f"cameras.{name}" if name else "camera"
 
 
+def _vacant_names(first: int, end: int, width: int) -> tuple[str, ...]:
+    """Names of rows that no landmark has, of slots of this width."""
+    return tuple(f"map.{VACANT}{i - (i - first) % width}.{MARKER[(i - first) % width]}" for i in range(first, end))
+
+
 def is_vacant(name: str) -> bool:
     """Whether a parameter of this name belongs to no landmark now."""
     return name.startswith(f"map.{VACANT}")
@@ -65,8 +70,8 @@ class Installation:
     Camera translation and rotation are right perturbations in the optical frame (x right, y down, z forward); a
     marker's translation is in the map frame, its rotation in its own.
 
-    A map may have more landmarks than can be states. Then those seen last are: each takes `VACANT` rows, which are
-    there from the start, and gives them up again (`occupy`, `vacate`). The others are `stateless`.
+    A map may have more landmarks than can be states. Then those seen last are: each takes vacant rows, and gives them up
+    again (`occupy`, `vacate`); there are few at first (`grow`). The others are `stateless`.
 
     Attributes:
         names: ``section.parameter``, of markers ``map.ID.parameter``, of several cameras ``cameras.NAME.parameter``.
@@ -74,6 +79,7 @@ class Installation:
         blocks: rows ``(first, count)`` of `camera_block` and "sightings", where there are such.
         landmarks: likewise, by id; 6 rows for a marker seen by its corners, else 2.
         stateless: prior covariance of the places of landmarks that are no states now, ``(6, 6)`` or ``(2, 2)``, by id.
+        most: how many landmarks of such a map can be states at a time.
         ground: on uneven ground the last three rows are `GROUND`: height, roll and pitch of the base. They are of the
             newest pose; in the graph each keyframe has its own.
         effects: what a constant changes; constants of one effect may be taken for one another.
@@ -109,12 +115,11 @@ class Installation:
         self.blocks: dict[str, tuple[int, int]] = {}
         self.landmarks: dict[int, tuple[int, int]] = {}
         self.stateless: dict[int, FloatArray] = {}
+        self.most = 0
         self._vacant: list[int] = []
         for i, name in enumerate(self.names):
             section, *rest = name.split(".")
-            if section == "map" and rest[0].startswith(VACANT):
-                self._vacant += [i] if rest[1] == POINT[0] else []
-            elif section == "map":
+            if section == "map":
                 first, count = self.landmarks.get(int(rest[0]), (i, 0))
                 self.landmarks[int(rest[0])] = (first, count + 1)
             elif section in _SENSORS:
@@ -144,6 +149,26 @@ class Installation:
             dtype=np.int64,
         )
 
+    def grow(self) -> slice:
+        """Add vacant rows, behind those that are the same for all poses, as long as there may be more.
+
+        Returns:
+            The rows.
+        """
+        width = len(MARKER) if any(len(cov) > len(POINT) for cov in self.stateless.values()) else len(POINT)
+        slots = len(self.landmarks) + self.vacancies
+        count, at = width * max(min(self.most - slots, _SLOTS), 0), self.constants
+        self.names = (*self.names[:at], *_vacant_names(at, at + count, width), *self.names[at:])
+        self.index = {name: i for i, name in enumerate(self.names)}
+        self._vacant += range(at, at + count, width)
+        self._prior_cov = np.insert(np.insert(self._prior_cov, [at] * count, 0.0, axis=0), [at] * count, 0.0, axis=1)
+        self._prior_mean = np.insert(self._prior_mean, [at] * count, 0.0)
+        rows = slice(at, at + count)
+        self._prior_cov[rows, rows] = VACANT_SIGMA**2 * np.eye(count)
+        self.sigmas = np.insert(self.sigmas, [at] * count, VACANT_SIGMA)
+        self.constants += count
+        return rows
+
     @property
     def vacancies(self) -> int:
         """How many more landmarks can become states."""
@@ -172,7 +197,7 @@ class Installation:
         first, count = self.landmarks.pop(landmark_id)
         rows = slice(first, first + count)
         self.stateless[landmark_id] = self._prior_cov[rows, rows].copy()
-        self._rename(rows, (f"map.{VACANT}{first}.{name}" for name in MARKER))
+        self._rename(rows, _vacant_names(first, first + count, len(MARKER)))
         self._prior_cov[rows, rows] = VACANT_SIGMA**2 * np.eye(count)
         self.sigmas[rows] = VACANT_SIGMA
         self._vacant.append(first)
@@ -285,6 +310,7 @@ def _block(name: str) -> str:
 _UNSEEN = 1e-6  # share of its variance by which measurements make a constant surer that they say nothing of
 _HELD = 1e-5  # sigma of a parameter that is taken as exact although its block is a state
 MOST_LANDMARKS = 40  # that are states at a time, to bound the work of a step
+_SLOTS = 8  # landmarks for which rows are added at a time
 
 
 def installation_of(
@@ -342,12 +368,14 @@ def installation_of(
     if len(by_id) <= most:
         sigmas |= {f"map.{i}.{name}": v for i, place in places.items() for name, v in place.items()}
         return Installation(sigmas | ground, given, effects, length)
-    largest = MARKER if any(len(place) > len(POINT) for place in places.values()) else POINT
-    sigmas |= {f"map.{VACANT}{slot}.{name}": VACANT_SIGMA for slot in range(most) for name in largest}
     made = Installation(sigmas | ground, None, effects, length)
     made.stateless = {
         i: _prior(place, given.get(i)) for i, place in places.items() if i in given or any(place.values())
     }
+    made.most = most
+    whole = ground or config.estimator.kind == "isam2"  # what holds all poses is not made anew for a few landmarks
+    while made.stateless and made.vacancies < (most if whole else min(most, _SLOTS)):
+        made.grow()
     return made
 
 

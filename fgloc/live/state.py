@@ -127,15 +127,17 @@ def read_state(path: Path, map_fingerprint: str, remedy: str = _FRESH) -> Resume
 
 
 def resumed_installation(saved: InstallationState, installation: Installation) -> InstallationEstimate | None:
-    """Saved estimate of the installation, but for the ground; None if the parameters are not the same."""
-    for name in saved.names:  # of a map of which some landmarks are states: those that were
-        section, _, rest = name.partition(".")
-        landmark_id = rest.partition(".")[0]
-        if section == "map" and landmark_id.lstrip("-").isdecimal() and int(landmark_id) in installation.stateless:
-            installation.occupy(int(landmark_id))
+    """Saved estimate of the installation, but for the ground; None if the parameters are not the same.
+
+    Of a map with more landmarks than can be states, those are that were, as far as there are rows for them.
+    """
     at = {name: i for i, name in enumerate(saved.names) if name not in GROUND and not is_vacant(name)}
+    for landmark_id in dict.fromkeys(int(name.split(".")[1]) for name in at if name.startswith("map.")):
+        if landmark_id in installation.stateless and installation.vacancies:
+            installation.occupy(landmark_id)
     here = {name: i for i, name in enumerate(installation.names[: installation.constants]) if not is_vacant(name)}
-    if not at or at.keys() != here.keys():
+    left_out = [name for name in at if name not in here and not (installation.stateless and name.startswith("map."))]
+    if not at or here.keys() - at.keys() or left_out:
         return None
     prior, rows, to = installation.prior(), [at[name] for name in here], list(here.values())
     prior.mean[to] = np.array(saved.mean)[rows]

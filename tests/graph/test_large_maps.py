@@ -18,7 +18,7 @@ from fgloc.sensors.measurements import PointMeasurement
 from fgloc.types import Landmark, LandmarkMap, MotionMeasurement
 
 PLACED = 0.05  # m: sigma of the map
-MOST = 8  # landmarks that are states; about three are in view
+MOST = 12  # landmarks that are states, eight at first; about three are in view
 SETTINGS = Config.model_validate({"map": {"position_sigma_m": PLACED}, "landmarks": {"range_scale_sigma": 0.0}})
 R = np.diag([0.005, 0.01]) ** 2
 STEP, Q = np.array([0.2, 0.0, 0.0]), np.diag([0.004, 0.002, 0.003]) ** 2
@@ -62,9 +62,14 @@ def test_a_landmark_takes_vacant_rows_and_gives_them_up_with_its_prior():
     held = dict(corridor(MOST + 2).landmarks)
     held[7] = replace(held[7], cov=np.array([[0.04, 0.01], [0.01, 0.09]]))
     made = installation_of(SETTINGS, LandmarkMap(held), False, most=MOST)
-    n, constants = len(made), [name for name in made.names if not name.startswith("map.")]
-    assert made.vacancies == MOST
+    constants = [name for name in made.names if not name.startswith("map.")]
+    assert made.vacancies == 8
     assert not made.landmarks
+    added = made.grow()
+    assert made.vacancies == MOST
+    assert added.stop - added.start == 2 * (MOST - 8)
+    assert made.grow().stop == made.constants == len(made)  # no more than that
+    n = len(made)
     assert set(made.stateless) == set(held)
     rows = made.occupy(7)
     assert made.landmarks == {7: (rows.start, 2)}
@@ -121,7 +126,7 @@ def test_a_map_that_has_few_landmarks_has_all_as_states():
     assert not factors.installation.stateless
     estimator = IncrementalEstimator(EstimatorConfig(), factors, keep_all=True)
     estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-4))
-    assert estimator.give_states() == []
+    assert estimator.give_states() == (slice(0, 0), [])
     assert of_whole_run(estimator.log, factors) is factors
 
 
