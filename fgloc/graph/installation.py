@@ -70,8 +70,8 @@ class Installation:
     Camera translation and rotation are right perturbations in the optical frame (x right, y down, z forward); a
     marker's translation is in the map frame, its rotation in its own.
 
-    A map may have more landmarks than can be states. Then those seen last are: each takes vacant rows, and gives them up
-    again (`occupy`, `vacate`); there are few at first (`grow`). The others are `stateless`.
+    A map may have more landmarks than can be states. Then those seen last are: each takes vacant rows, and gives them
+    up again (`occupy`, `vacate`); there are few at first (`grow`). The others are `stateless`.
 
     Attributes:
         names: ``section.parameter``, of markers ``map.ID.parameter``, of several cameras ``cameras.NAME.parameter``.
