@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -26,11 +25,9 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
 from fgloc.results import RunData
 from fgloc.sensors import registry
-from fgloc.types import Estimate, Finding, FloatArray, Ground, Protection, Severity, Trajectory, note, ordered
+from fgloc.types import Estimate, Finding, FloatArray, Grave, Ground, Protection, Severity, Trajectory, note, ordered
 
 # --- Results besides poses, and their sentences -------------------------------------------------
-
-_GRAVE = re.compile(r"another (frame|clock)|is damaged|cannot be decoded|perhaps degrees|none of the ids")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +70,7 @@ class Outcome:
             *note("setup.unseen", map(sentence, hints), Severity.WARNING),
             *(f for f in seen_in_images if f.code not in known),
             *_graded("recording", recording.notes),
-            *_graded("clock", replay.clocks.notes),
+            *note("clock", map(sentence, replay.clocks.notes)),
             *_graded("run", parts.sentences),
         ]
         return cls(recording.roles, rejections, tuple(findings))
@@ -96,9 +93,9 @@ def _hints(recording: Recording, parts: Assembly, replay: Replay) -> list[str]:
 
 
 def _graded(code: str, texts: Iterable[str]) -> Iterator[Finding]:
-    """Findings of a part of the run: warnings where data are damaged or in another frame, clock or unit."""
+    """Findings of a part of the run: warnings of what it calls grave."""
     for text in texts:
-        yield Finding(code, sentence(text), Severity.WARNING if _GRAVE.search(text) else Severity.NOTE)
+        yield Finding(code, sentence(text), Severity.WARNING if isinstance(text, Grave) else Severity.NOTE)
 
 
 def sentence(note: str) -> str:

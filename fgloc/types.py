@@ -387,6 +387,10 @@ def note(code: str, texts: Iterable[str], severity: Severity = Severity.NOTE) ->
     return [Finding(code, text, severity) for text in texts]
 
 
+class Grave(str):
+    """A note of which a warning is made: data are damaged, in another unit, or not of this map."""
+
+
 REMARKS = ("run", "recording", "batch")
 """Codes of sentences on what a run does with its recording and settings; nothing was compared."""
 

@@ -15,7 +15,7 @@ from fgloc.config import Config, GateConfig, camera_role
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
 from fgloc.sensors.checks import EMPTIED, Changes, FieldChecks
-from fgloc.types import Event, MotionEvent, SightingsEvent, TransformEvent, TruthEvent
+from fgloc.types import Event, Grave, MotionEvent, SightingsEvent, TransformEvent, TruthEvent
 
 _RECENT = 64  # accepted stamps of a topic that are remembered to find duplicates
 _MOST_NOTES, _LONGEST_NOTE = 40, 1000  # sentences, and characters of one
@@ -168,10 +168,11 @@ class EventValidator:
         for reason in sorted(r for r in self.rejections if r.endswith("yaw_rate_bound")):
             bad, seen = self.rejections[reason], self._seen[reason.split(".")[0]]
             if bad >= 10 and bad > 0.1 * seen:
-                notes.append(
+                text = (
                     f"{bad} of {seen} yaw rates ({reason}) exceed {self._config.max_yaw_rate:g} rad/s: perhaps degrees "
                     "were given for radians; else raise expert.gate.max_yaw_rate"
                 )
+                notes.append(Grave(text))
         for name, topic in self._topics.items():
             if topic.stray:
                 notes.append(

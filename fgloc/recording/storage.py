@@ -29,6 +29,7 @@ from fgloc.recording.limits import (
     opening,
 )
 from fgloc.recording.recover import recover, sqlite_journals
+from fgloc.types import Grave
 
 # --- metadata.yaml of a rosbag2 folder; hostile contents are refused --------------------------------------------------
 
@@ -149,8 +150,9 @@ def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[
         names = ", ".join(file.name for files in groups.values() for file in files)
         raise RecordingError(f"{path}: no usable metadata.yaml and several storage kinds ({names}); give one file")
     files = next(iter(groups.values()))
-    state = "damaged" if (path / "metadata.yaml").exists() else "missing"
-    notes.append(f"metadata.yaml is {state}: {', '.join(file.name for file in files)} opened directly.")
+    opened = f"{', '.join(file.name for file in files)} opened directly."
+    damaged = (path / "metadata.yaml").exists()
+    notes.append(Grave(f"metadata.yaml is damaged: {opened}") if damaged else f"metadata.yaml is missing: {opened}")
     return None, tuple(files)
 
 
@@ -259,7 +261,7 @@ class Storage:
         try:
             decompress_file(file, target)
         except (OSError, EOFError) as error:
-            self.notes.append(f"{file.name} is damaged ({_reason(error)}): what comes before is used.")
+            self.notes.append(Grave(f"{file.name} is damaged ({_reason(error)}): what comes before is used."))
         return target
 
     def _compare_count(self, expected: int) -> None:
@@ -415,10 +417,8 @@ class _File:
         self._recovered = True
         self.close()
         self.reader = reader
-        self._note(
-            f"{self._path.name} is damaged ({reason}): salvaged {recovered.messages} messages, "
-            f"{recovered.lost:.1%} of its bytes are lost{_CUT if recovered.lost < _WHOLE else ''}."
-        )
+        lost = f"{recovered.lost:.1%} of its bytes are lost{_CUT if recovered.lost < _WHOLE else ''}"
+        self._note(Grave(f"{self._path.name} is damaged ({reason}): salvaged {recovered.messages} messages, {lost}."))
 
     def _note(self, text: str) -> None:
         if text not in self._notes:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc.types import MAX_LANDMARK_ID, Event, FloatArray, RawEvent, Sighting, SightingsEvent
+from fgloc.types import MAX_LANDMARK_ID, Event, FloatArray, Grave, RawEvent, Sighting, SightingsEvent
 
 if TYPE_CHECKING:
     from fgloc.config import Config, GateConfig
@@ -140,7 +140,7 @@ class FieldChecks:
             return ()
         unknown, known = _listed(self._unknown), _listed(self._known or ())
         if not self._any_known:
-            return (f"none of the ids that were seen ({unknown}) is in the map, which has {known or 'none'}",)
+            return (Grave(f"none of the ids that were seen ({unknown}) is in the map, which has {known or 'none'}"),)
         return (f"sightings of ids that are not in the map are ignored: {unknown} (it has {known})",)
 
     def note(self, text: str) -> None:

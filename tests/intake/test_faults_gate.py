@@ -28,6 +28,7 @@ from fgloc.config import GateConfig, WheelsConfig
 from fgloc.errors import ConfigError
 from fgloc.intake.validation import EventValidator
 from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.types import Grave
 
 
 @pytest.fixture
@@ -443,14 +444,16 @@ def test_fault_32_yaw_rate_in_degrees(gate):
 def test_fault_32_most_yaw_rates_beyond_the_bound_suggest_degrees(gate):
     for k in range(40):
         gate.check(command(1 + k / 10, 0.2, 30.0 if k % 2 else 0.0))
-    assert any("degrees" in note for note in gate.notes)
+    assert any("degrees" in note and isinstance(note, Grave) for note in gate.notes)
 
 
 def test_fault_50_id_not_in_the_map(gate):
+    assert gate.check(corners(0.5, 17)) is None
+    assert isinstance(gate.notes[-1], Grave)  # none is: it may be another map
     event = gate.check(corners(1.0, 2, 17, 1))
     assert [s.landmark_id for s in event.sightings] == [2, 1]
     assert gate.check(range_bearing(1.0, (99, 1.0, 0.0))) is None
-    assert gate.rejections == {"sightings.unknown_id": 2}
+    assert gate.rejections == {"sightings.unknown_id": 3}
     assert any(": 17, 99 (it has " in note for note in gate.notes)
     free = EventValidator(GateConfig())  # no map: every id may turn out to be a landmark
     assert free.check(corners(1.0, 17)) is not None

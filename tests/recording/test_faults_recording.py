@@ -21,6 +21,7 @@ from fgloc.files.documents import HostileError
 from fgloc.recording.reader import open_recording
 from fgloc.recording.recover import recover_mcap
 from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import Grave
 
 DEFAULT = RecordingConfig()
 
@@ -38,6 +39,7 @@ def note_of(notes: tuple[str, ...], word: str) -> str:
 
 
 def lost_share(note: str) -> float:
+    assert isinstance(note, Grave)
     return float(re.search(r"([\d.]+)% of its bytes are lost", note).group(1)) / 100
 
 
