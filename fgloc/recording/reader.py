@@ -162,7 +162,7 @@ class Selection:
 
 
 def select_roles(
-    topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str] | None = None
+    topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str] | None = None, growing: bool = False
 ) -> Selection:
     """Find a topic for each role.
 
@@ -170,8 +170,9 @@ def select_roles(
         topics: all topics; those without messages are no candidates.
         config: topics given by the user; they win, and "none" switches a role off.
         beside: topics of the odometries beside the wheels, by role.
+        growing: a configured topic that is not there may still come: that is no problem.
     """
-    roles, problems, notes = _given_roles(topics, config, beside or {})
+    roles, problems, notes = _given_roles(topics, config, beside or {}, growing)
     filled = [topic for topic in topics if topic.count > 0]
     names = (*role_names(), *config.of_cameras)
     for role in sorted(names, key=_by_dependence):
@@ -214,17 +215,17 @@ def select_roles(
 
 
 def _given_roles(
-    topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str]
+    topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str], growing: bool
 ) -> tuple[dict[Role, str], list[str], list[str]]:
     """Roles that the user gave, what is wrong with them, and the cameras that have nothing in the recording."""
     roles: dict[Role, str] = {}
     problems: list[str] = []
     notes: list[str] = []
-    filled = {topic.name for topic in topics if topic.count > 0}
+    there, filled = {topic.name for topic in topics}, {topic.name for topic in topics if topic.count > 0}
     seeing = [t for role, t in config.of_cameras.items() if base_role(role) != "camera_info" and t in filled]
     own = ((role, config.given(role)) for role in (*role_names(), *config.of_cameras))
     for role, given in (*own, *beside.items()):
-        if given is None or given == "none":
+        if given is None or given == "none" or (growing and given not in there):
             continue
         if role in config.of_cameras and given not in filled and seeing:
             notes.append(f"{topic_key(role)}: {given} has no messages; the run goes on without it.")

@@ -135,6 +135,10 @@ def test_the_configuration_of_another_robot_is_told_as_such():
     assert len(select(("/odom", ODOMETRY), ("/imu/data", IMU), odometry="/odom", truth="/mocap/pose").problems) == 1
 
 
+def test_configured_topics_that_may_still_come_are_no_problem():
+    assert not select_roles([], TopicsConfig(odometry="/odom", imu="/imu"), growing=True).problems
+
+
 def test_open_recording_refuses_what_is_ambiguous(tmp_path):
     from fgloc_datasets.bag import BagWriter
 

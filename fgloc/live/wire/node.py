@@ -75,13 +75,11 @@ class Intake:
             self._found, self._changed_s = found, time.monotonic()
         if time.monotonic() - self._changed_s < SETTLED_S:
             return ""
-        selection = select_roles(
-            [TopicInfo(p.topic, p.message_type, 1) for p in found], self._config.topics, self._config.beside
-        )
+        topics = [TopicInfo(p.topic, p.message_type, 1) for p in found]
+        selection = select_roles(topics, self._config.topics, self._config.beside, growing=True)
         missing = "" if self.roles else self._missing(selection.roles)
-        wrong = [problem for problem in selection.problems if "is not in the recording" not in problem]
-        if wrong and not self.roles:  # a configured topic that is not there may come
-            raise WireError("\n".join(wrong))
+        if selection.problems and not self.roles:
+            raise WireError("\n".join(selection.problems))
         if not missing:
             self.roles = {**selection.roles, **self.roles}
         return missing
