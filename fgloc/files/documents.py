@@ -300,7 +300,11 @@ def check_regular(path: Path, error: type[FglocError], remedy: str, max_bytes: i
 
 
 def read_document(
-    path: Path, error: type[FglocError], max_bytes: int = _MAX_BYTES, remedy: str = "give a YAML or JSON file"
+    path: Path,
+    error: type[FglocError],
+    max_bytes: int = _MAX_BYTES,
+    remedy: str = "give a YAML or JSON file",
+    empty: str = "",
 ) -> Item:
     """Read a YAML or JSON file, or one that OpenCV wrote: its head and its tags are no YAML, and are left out.
 
@@ -309,6 +313,7 @@ def read_document(
         error: what to raise, here and in the items' methods.
         max_bytes: a larger file is refused.
         remedy: what to do about a file that cannot be read.
+        empty: what an empty file stands for; "": it is refused.
 
     Raises:
         FglocError: of the given type; the file is missing, no regular file, too large, empty, not YAML, or hostile.
@@ -318,7 +323,7 @@ def read_document(
         text = text.removeprefix(text.partition("\n")[0] if text.startswith(_OPENCV) else "")
         text = text.replace(_OPENCV_MATRIX, "")
     try:
-        node = parse(text, str(path))
+        node = parse(text, str(path)) or parse(empty, str(path))
     except yaml.YAMLError as cause:
         indented = _indented_by_tab(text, cause)
         hint = f"line {indented} is indented by a tab; YAML takes spaces only" if indented else str(cause)

@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, to_jsonable_python
 
 from fgloc.errors import ConfigError
-from fgloc.files.documents import Item, plain, read_document
+from fgloc.files.documents import plain, read_document
 
 SHIPPED = "shipped:"
 """Begins the name of a file that comes with fgloc."""
@@ -250,24 +250,16 @@ class Settings:
             ConfigError: it is missing, not YAML, hostile, or not keys with values.
         """
         self.path = path
-        self._item: Item | None = None
-        self.content: dict[str, Any] = {}
-        try:
-            self._item = read_document(path, ConfigError, MAX_BYTES, remedy)
-        except ConfigError as error:
-            if "the file is empty" in str(error):
-                return
-            raise
+        self._item = read_document(path, ConfigError, MAX_BYTES, remedy, empty="{}")
         try:
             content = plain(self._item.node)
         except yaml.MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark is not None else 1
             raise ConfigError(f"{path}:{line}: {error.problem}") from error
-        if content is None:
-            content = {}
+        content = {} if content is None else content
         if not isinstance(content, dict):
             raise ConfigError(f"{path}:{self._item.line}: expected keys with values, got {short(content)}; {remedy}")
-        self.content = content
+        self.content: dict[str, Any] = content
 
     def validated_in_parts(self, model: type[S]) -> S:
         """The content as a model some of whose values are under ``expert`` in the file, and some are constants.
@@ -300,8 +292,7 @@ class Settings:
 
     def _line(self, loc: Sequence[int | str]) -> int:
         """Line of a value, or of the innermost thing around it that there is."""
-        node = self._item.node if self._item is not None else None
-        line = 1
+        node, line = self._item.node, 1
         for part in loc:
             if isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
                 node = node.value[part]
