@@ -92,8 +92,8 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
         found = _Search(path, map_path, now.of_camera(name), landmark_map)
         found.run()
         codes = {finding.code for finding in findings}  # of the motion, which every camera's search judges again
-        again = of_camera(found.findings, name)
-        findings += [f for f in again if f.code not in codes or f.text.startswith(f"Camera {name}:")]
+        again = zip(found.findings, of_camera(found.findings, name), strict=True)
+        findings += [own for f, own in again if f.code not in codes or own != f]
         now, landmark_map = now.with_camera(name, found.config), found.landmark_map
     undone = now != config or landmark_map is not None
     if undone and any(finding.severity is Severity.ERROR for finding in findings):
