@@ -297,7 +297,7 @@ def _flat(folder: Path, config: Config) -> dict[str, float]:
     return {
         "flat_plane_mm": 1e3 * metrics.ate_mean_m,
         "flat_step_ms": float(np.median(result.step_ms)),
-        "flat_named": float(any("floor is not flat" in mistake for mistake in result.mistakes)),
+        "flat_named": float(any(f.code == "floor.uneven" for f in result.findings)),
     }
 
 

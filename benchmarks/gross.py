@@ -3,9 +3,9 @@
 Each of `MISTAKES` is made on three simulated recordings as installed, of a minute each, and
 `fgloc.runner.run` and `fgloc info` are asked about it.
 
-- ``gross.named``: share of mistakes that the first note of the run (or its error) names, with the line to be set (its
-  value within 2 to 25 % of the true one) and an exit code other than 0. ``gross.info``: likewise of the first line that
-  ``fgloc info`` has to say.
+- ``gross.named``: share of mistakes that the first finding of the run (or its error) names by its code, with the line
+  to be set or a figure (within 2 to 25 % of the true one) and an exit code other than 0. ``gross.info``: likewise of
+  the first thing that ``fgloc info`` has to say.
 - ``gross.false``: sound runs of which a mistake is named: those without a mistake, and the bundled samples.
 - ``gross.seconds``: processor time of the run with the mistake over that of the sound run; largest and median.
 """
@@ -39,23 +39,23 @@ from fgloc.files.settings import joined
 from fgloc.recording.messages import default_typestore
 from fgloc.replay import RunMode
 from fgloc.runner import run
-from fgloc.types import FloatArray
+from fgloc.types import Finding, FloatArray, note
 from fgloc_datasets.sim.camera import RenderError
 
 RECORDINGS = 3
 QUICK = ("size_0.95", "joints_swapped", "dictionary")
-_END = re.compile(r"(?<=\.)\s+(?=[A-Z])")  # of a sentence
 _VALUE = re.compile(r"\(\?#(\S+) (\S+)\)")  # in a pattern: the bounds of its group "value"
+NOTHING = Finding("", "")
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """First sentence, exit code and processor time of one run; and the first line of ``fgloc info``."""
+    """First finding, exit code and processor time of one run; and the first finding of ``fgloc info``."""
 
-    first: str
+    first: Finding
     code: int
     seconds: float
-    info: str
+    info: Finding
 
 
 def outcome(bag: Path, mode: RunMode) -> Outcome:
@@ -65,27 +65,26 @@ def outcome(bag: Path, mode: RunMode) -> Outcome:
     began = time.process_time()
     try:
         result = run(bag, map_path, config, mode)
-        first, code = next(iter(result.notes), ""), exit_code(result)
-    except FglocError as error:
-        first, code = str(error), EXIT_BAD_INPUT
+        first, code = next(iter(result.findings), NOTHING), exit_code(result)
     except Exception as error:  # a crash is a result too: it names nothing
-        first, code = f"{type(error).__name__}: {error}", EXIT_BAD_INPUT
+        first, code = Finding(type(error).__name__, str(error)), EXIT_BAD_INPUT
     seconds = time.process_time() - began
     try:
         report = inspect_all(bag, map_path, config)
-        info = next(iter((*report.problems, *report.findings)), "")
+        info = next(iter((*note("problem", report.problems), *report.found)), NOTHING)
     except FglocError as error:
-        info = str(error)
+        info = Finding(type(error).__name__, str(error))
     return Outcome(first, code, seconds, info)
 
 
-def names(pattern: str, sentence: str) -> bool:
-    """Whether the first sentence matches, its value within the bounds that the pattern has in a comment."""
-    found = re.search(pattern, _END.split(sentence, maxsplit=1)[0])
+def names(pattern: str, finding: Finding) -> bool:
+    """Whether code, figure, lines and text of a finding match, in this order, the value within the pattern's bounds."""
+    lines = "; ".join(f"{key}: {value}" for key, value in finding.lines.items())
+    found = re.match(pattern, f"{finding.code} {finding.value} {lines}\n{finding.text}")
     if found is None:
         return False
     bounds = _VALUE.search(pattern)
-    return bounds is None or float(bounds[1]) <= float(found["value"].rstrip(".")) <= float(bounds[2])
+    return bounds is None or float(bounds[1]) <= float(found["value"]) <= float(bounds[2])
 
 
 def measure(quick: bool, split: Split = "test", mistakes: Sequence[str] = (), mode: RunMode = "batch") -> Iterator[Row]:
@@ -110,7 +109,7 @@ def measure(quick: bool, split: Split = "test", mistakes: Sequence[str] = (), mo
     for sample in () if quick else sorted(SAMPLES.iterdir()):
         if (sample / "bag").is_dir():
             sound.append(outcome(sample / "bag", mode))
-            print(f"{sample.name}: {sound[-1].code} {sound[-1].first}", file=sys.stderr, flush=True)
+            print(f"{sample.name}: {sound[-1].code} {sound[-1].first.text}", file=sys.stderr, flush=True)
     yield from _rows(sound, wrong)
 
 
@@ -136,7 +135,7 @@ def _rows(sound: Sequence[Outcome], wrong: dict[str, list[Outcome]]) -> Iterator
 def _say(take: Take, name: str, o: Outcome, pattern: str = "") -> None:
     good = f"{names(pattern, o.first)!s:5} {names(pattern, o.info)!s:5}" if pattern else " " * 11
     print(
-        f"{take.seed} {name:20} {good} {o.code} {o.seconds:6.1f} s  {o.first}\n    {o.info}",
+        f"{take.seed} {name:20} {good} {o.code} {o.seconds:6.1f} s  {o.first.text}\n    {o.info.text}",
         file=sys.stderr,
         flush=True,
     )
@@ -154,10 +153,10 @@ Edit = Callable[[Any], None]
 
 @dataclass(frozen=True, slots=True)
 class Mistake:
-    """One mistake, and what the first sentence about it has to hold.
+    """One mistake, and what the first finding has to hold.
 
     Attributes:
-        said: regular expression.
+        said: regular expression of code, figure and lines; where the text alone has ids or names, of these.
         robot: changes ``robot.yaml``, given the first pose of the truth too.
         map: changes ``map.yaml``.
         messages: by topic.
@@ -174,18 +173,18 @@ def _size(factor: float) -> Mistake:
         for landmark in landmarks["landmarks"]:
             landmark["size"] *= factor
 
-    low, high = 0.2 * 0.98, 0.2 * 1.02
-    return Mistake(rf"size.*set size: (?P<value>[\d.]+)(?#{low:.4f} {high:.4f})", map=change)
+    return Mistake(rf"map\.size (?P<value>[\d.]+)(?#{0.98 / factor:.4f} {1.02 / factor:.4f})", map=change)
 
 
-def _mounted(roll: float, pitch: float, yaw: float, said: str) -> Mistake:
+def _mounted(roll: float, pitch: float, yaw: float) -> Mistake:
     """The transform of the camera turned by these angles [deg] against the true one."""
 
     def change(robot: Settings, start: tuple[float, float, float]) -> None:
         angles = [math.radians(a) for a in (roll, pitch, yaw)]
         robot.setdefault("recording", {})["sightings_pose"] = [0.1, 0.0, 0.25, *angles]
 
-    return Mistake(said, robot=change)
+    true_yaw = r"recording\.sightings_pose: \[[^\]]*, (?P<value>[-\d.e]+)\](?#-0.03 0.03)"
+    return Mistake(rf"sightings\.mounting .*{true_yaw}", robot=change)
 
 
 def _radius(factor: float) -> Mistake:
@@ -193,7 +192,7 @@ def _radius(factor: float) -> Mistake:
         for side in ("left_radius", "right_radius"):
             robot["wheels"][side] *= factor
 
-    return Mistake(r"radi.*left_radius: (?P<value>[\d.]+)(?#0.0485 0.0515)", robot=change)
+    return Mistake(r"wheels\.scale .*left_radius: (?P<value>[\d.]+)(?#0.0485 0.0515)", robot=change)
 
 
 def _swap_joints(robot: Settings, start: tuple[float, float, float]) -> None:
@@ -285,33 +284,29 @@ MISTAKES: dict[str, Mistake] = {
     "size_1.05": _size(1.05),
     "size_0.8": _size(0.8),
     "size_1.2": _size(1.2),
-    "dictionary": Mistake(r"DICT_4X4_50.*markers\.dictionary", robot=_dictionary),
-    "info_resolution": Mistake(r"640x480.*320x240", messages={"/camera/camera_info": _half}),
-    "info_scaled": Mistake(
-        r"focal_scale: (?P<value>[\d.]+)(?#0.485 0.515)", messages={"/camera/camera_info": _double_k}
-    ),
+    "dictionary": Mistake(r"markers\.dictionary .*\n.*but of DICT_4X4_50", robot=_dictionary),
+    "info_resolution": Mistake(r"(CameraError|problem) .*\n.*640x480.*320x240", messages={_CAMERA[0]: _half}),
+    "info_scaled": Mistake(r"camera\.resolution (?P<value>[\d.]+)(?#0.485 0.515)", messages={_CAMERA[0]: _double_k}),
     "info_distortion": Mistake(
-        r"camera\.k1: (?P<value>-?[\d.]+)(?#-0.15 -0.09)", messages={_CAMERA[0]: _no_distortion}
+        r"camera\.distortion .*camera\.k1: (?P<value>-?[\d.]+)(?#-0.15 -0.09)", messages={_CAMERA[0]: _no_distortion}
     ),
-    "camera_upside_down": _mounted(180.0, 0.0, 0.0, r"upside down.*sightings_pose"),
-    "camera_quarter_roll": _mounted(90.0, 0.0, 0.0, r"camera.*viewing axis.*sightings_pose"),
-    "camera_yaw_90": _mounted(0.0, 0.0, 90.0, r"camera.*right.*sightings_pose"),
-    "camera_yaw_10": _mounted(0.0, 0.0, 10.0, r"camera.*right.*sightings_pose"),
-    "camera_pitch_15": _mounted(0.0, 15.0, 0.0, r"camera.*sightings_pose"),
-    "joints_swapped": Mistake(r"left_joint: left_wheel_joint.*right_joint: right_wheel_joint", robot=_swap_joints),
+    "camera_upside_down": _mounted(180.0, 0.0, 0.0),
+    "camera_quarter_roll": _mounted(90.0, 0.0, 0.0),
+    "camera_yaw_90": _mounted(0.0, 0.0, 90.0),
+    "camera_yaw_10": _mounted(0.0, 0.0, 10.0),
+    "camera_pitch_15": _mounted(0.0, 15.0, 0.0),
+    "joints_swapped": Mistake(r"wheels\.sign .*right_joint: right_wheel_joint", robot=_swap_joints),
     "radius_1.1": _radius(1.1),
     "radius_2": _radius(2.0),
-    "roll_over": Mistake(r"angle_range: (?P<value>[\d.]+)(?#6.28 6.29)", messages={"/joint_states": _roll_over}),
-    "map_mirrored": Mistake(r"map is mirrored", map=_mirror),
-    "map_shifted": Mistake(r"map is shifted", robot=_start_here, map=_shift_map),
-    "ids_swapped": Mistake(r"ids? 7 and 9.*(exchange|swap)", map=_swap_ids),
-    "odometry_frame": Mistake(r"[Oo]dometry.*turned", robot=_by_odometry, messages={"/odom": _quarter_turn}),
-    "truth_frame": Mistake(r"truth\.align: se2", messages={"/truth": _other_frame}),
-    "camera_late": Mistake(
-        r"stamp_offset_s: \{image: (?P<value>-?[\d.]+)(?#-0.34 -0.26)", messages=dict.fromkeys(_CAMERA, _late(0.3))
-    ),
-    "camera_clock": Mistake(r"image.*received_stamps", messages=dict.fromkeys(_CAMERA, _late(3600.0))),
-    "imu_clock": Mistake(r"imu.*received_stamps", messages={"/imu": _late(-1000.0)}),
+    "roll_over": Mistake(r"wheels\.roll_over .*: (?P<value>.*)(?#6.28 6.29)", messages={"/joint_states": _roll_over}),
+    "map_mirrored": Mistake(r"map\.mirrored ", map=_mirror),
+    "map_shifted": Mistake(r"frame\.first_pose ", robot=_start_here, map=_shift_map),
+    "ids_swapped": Mistake(r"map\.ids .*\n.*ids 7 and 9 ", map=_swap_ids),
+    "odometry_frame": Mistake(r"odometry\.twist_frame .*pose", robot=_by_odometry, messages={"/odom": _quarter_turn}),
+    "truth_frame": Mistake(r"truth\.frame .*se2", messages={"/truth": _other_frame}),
+    "camera_late": Mistake(r"clock\.image (?P<value>[\d.]+)(?#0.26 0.34)", messages=dict.fromkeys(_CAMERA, _late(0.3))),
+    "camera_clock": Mistake(r"clock\.received .*image", messages=dict.fromkeys(_CAMERA, _late(3600.0))),
+    "imu_clock": Mistake(r"clock\.received .*imu", messages={"/imu": _late(-1000.0)}),
 }
 
 

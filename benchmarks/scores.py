@@ -16,6 +16,8 @@ import numpy as np
 
 from benchmarks.recordings import Recorded, slip_intervals
 from fgloc.config import Config
+from fgloc.estimation.log import OVERRULED
+from fgloc.estimation.motion import KNOWN
 from fgloc.evaluation.metrics import match_result, nees
 from fgloc.runner import RunResult
 from fgloc.types import Decision, FloatArray, IntArray, LandmarkMap, Mode
@@ -25,7 +27,7 @@ Found = Mapping[str, tuple[float, float]]
 SIGHTINGS = frozenset({"corners", "range_bearing", "marker_pose"})  # kinds of decisions
 _FOUND_AFTER_S = 1.0  # a robot that was carried away may be lost so long after the first marker seen again
 _ANGLES = frozenset({"roll", "pitch", "yaw"})
-_NOT_FOUND_BY_MOTION = {"", "distrusted", "overruled by sightings"}  # reasons that no detector gave
+_NOT_FOUND_BY_MOTION = {"", KNOWN, OVERRULED}  # reasons that no detector gave
 _NAMED = re.compile(r"[Mm]arker (\d+) does not stand where the map has it")
 _LINGER_S = 0.5  # a slip that is flagged so long after its end was still found
 _WINDOW_S = 2.0  # a flag may be of a slip, however short, so long before it: the detector's window

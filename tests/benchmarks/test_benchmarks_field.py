@@ -136,4 +136,5 @@ def test_the_sheet_is_of_recordings_and_no_trap_is_sound():
     names = {recording.name for recording in RECORDINGS}
     assert {row.recording for row in (*SHEET, *SOUND)} <= names
     for trap in SHEET:
-        assert (trap.figure is not None) == ("(?P<value>" in re.compile(trap.said).pattern)
+        assert not trap.said or (trap.figure is not None) == ("(?P<value>" in re.compile(trap.said).pattern)
+        assert trap.code or trap.said

@@ -7,23 +7,26 @@ import re
 import pytest
 
 from benchmarks.gross import MISTAKES, names
+from fgloc.types import Finding, Severity
 
 
 @pytest.mark.parametrize(
-    ("sentence", "named"),
+    ("name", "code", "value", "lines", "named"),
     [
-        ("The markers' size is 0.19 m by the map: set size: 0.1995 in the map.", True),
-        ("The markers' size is 0.19 m by the map: set size: 0.22 in the map.", False),  # not the true one
-        ("The markers' size is wrong.", False),
-        ("Something else is wrong. The markers' size: set size: 0.2.", False),  # not in the first sentence
+        ("size_0.95", "map.size", 1.05, {}, True),
+        ("size_0.95", "map.size", 1.2, {}, False),  # not the true one
+        ("size_0.95", "map.size", None, {}, False),
+        ("size_0.95", "map.unit", 1.05, {}, False),
+        ("camera_yaw_90", "sightings.mounting", None, {"recording.sightings_pose": "[0.1, 0.0, -1e-05]"}, True),
+        ("camera_yaw_90", "sightings.mounting", None, {"recording.sightings_pose": "[0.1, 0.0, 1.57]"}, False),
     ],
 )
-def test_only_the_first_sentence_with_the_right_value_counts(sentence, named):
-    assert names(MISTAKES["size_0.95"].said, sentence) is named
+def test_only_the_code_with_the_right_figure_counts(name, code, value, lines, named):
+    assert names(MISTAKES[name].said, Finding(code, "Text.", Severity.ERROR, lines, value)) is named
 
 
 def test_every_pattern_is_one_and_no_usual_note_matches():
-    usual = "/odom: pose covariance is zero; the configured default is used."
+    usual = Finding("run", "/odom: pose covariance is zero; the configured default is used.")
     for mistake in MISTAKES.values():
         re.compile(mistake.said)
         assert not names(mistake.said, usual)
