@@ -302,7 +302,9 @@ MISTAKES: dict[str, Mistake] = {
     "map_mirrored": Mistake(r"map\.mirrored ", map=_mirror),
     "map_shifted": Mistake(r"frame\.first_pose ", robot=_start_here, map=_shift_map),
     "ids_swapped": Mistake(r"map\.ids .*\n.*ids 7 and 9 ", map=_swap_ids),
-    "odometry_frame": Mistake(r"odometry\.twist_frame .*pose", robot=_by_odometry, messages={"/odom": _quarter_turn}),
+    "odometry_frame": Mistake(
+        r"odometry\.twist_unit (?P<value>\S+) .*pose(?#0.9 1.1)", robot=_by_odometry, messages={"/odom": _quarter_turn}
+    ),
     "truth_frame": Mistake(r"truth\.frame .*se2", messages={"/truth": _other_frame}),
     "camera_late": Mistake(r"clock\.image (?P<value>[\d.]+)(?#0.26 0.34)", messages=dict.fromkeys(_CAMERA, _late(0.3))),
     "camera_clock": Mistake(r"clock\.received .*image", messages=dict.fromkeys(_CAMERA, _late(3600.0))),
