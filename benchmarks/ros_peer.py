@@ -651,6 +651,47 @@ def damaged(bag: str, parameters: Mapping[str, Any], count: int, seed: int) -> d
             node.end()
 
 
+def waiting(count: int) -> list[int]:
+    """Numbers of messages of several topics that wait while the executor does something else, as they are handed on.
+
+    They are numbered as they are published: images, odometry and an IMU, of other rates.
+    """
+    import rclpy
+    from fgloc_ros.transport import RosTransport
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.lifecycle import LifecycleNode
+    from rosidl_runtime_py.utilities import get_message
+
+    rclpy.init()
+    node, peer = LifecycleNode("reads"), rclpy.create_node("peer")
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    transport = RosTransport(node, "map")
+    found: list[int] = []
+    kinds = {"/a": "sensor_msgs/msg/Imu", "/b": "nav_msgs/msg/Odometry", "/c": "sensor_msgs/msg/CompressedImage"}
+    publishers = {topic: peer.create_publisher(get_message(kind), topic, 1000) for topic, kind in kinds.items()}
+    for topic, kind in kinds.items():
+        transport.read(topic, kind, lambda heard: found.append(transport.decode(heard).header.stamp.sec))
+
+    def spin_until(condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition() and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.05)
+
+    spin_until(lambda: all(one.get_subscription_count() for one in publishers.values()))
+    for k in range(count):
+        topic = "/c" if k % 20 == 10 else "/b" if k % 5 == 1 else "/a"
+        message = get_message(kinds[topic])()
+        message.header.stamp.sec = k
+        publishers[topic].publish(message)
+        time.sleep(0.001)
+    time.sleep(0.5)  # all have arrived
+    spin_until(lambda: len(found) == count)
+    transport.close()
+    rclpy.try_shutdown()
+    return found
+
+
 _TRANSITIONS = {"unconfigured": (1,), "inactive": (2, 3), "active": (4,), "finalized": ()}
 _SHUTDOWNS = (5, 6, 7)  # they end what there is to be changed
 _ALL = {1, 2, 3, 4, *_SHUTDOWNS}

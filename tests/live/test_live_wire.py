@@ -27,6 +27,7 @@ from fgloc.live.wire.participant import (
 )
 from fgloc.live.wire.participant import Writer as WireWriter
 from fgloc.live.wire.play import Player
+from fgloc.live.wire.transport import in_order
 from fgloc.recording.messages import Messages
 from fgloc.recording.reader import converters_of, open_recording
 
@@ -165,6 +166,48 @@ def test_the_receive_time_is_that_of_writing_where_the_clocks_agree(simulated_ns
         sample = Sample("/a", TWIST, b"", time.time_ns() if source_ns is None else source_ns)
         found = clock.received_ns(sample)
     assert abs(found - (time.time_ns() if received_ns is None else received_ns)) < (0.5e9 if received_ns is None else 1)
+
+
+class _Queue:
+    """Messages that wait; others come while they are taken, one each time."""
+
+    def __init__(self, waiting, coming=()):
+        self.waiting, self._coming = [*waiting], [*coming]
+
+    def take(self, most):
+        taken, self.waiting = self.waiting[:most], self.waiting[most:]
+        if self._coming:
+            self.waiting.append(self._coming.pop(0))
+        return [(stamp, stamp) for stamp in taken]
+
+
+def test_what_waits_in_several_queues_is_in_the_order_of_writing():
+    fast, slow, empty = _Queue(range(1, 1001)), _Queue(range(50, 1001, 100)), _Queue([])
+    found = in_order([(2000, one.take) for one in (fast, slow, empty)])
+    assert found == sorted([*range(1, 1001), *range(50, 1001, 100)])
+    assert in_order([(2000, empty.take)]) == []
+
+
+def test_a_queue_is_looked_at_again_if_others_have_brought_something_newer():
+    early, late = _Queue([1], coming=[2]), _Queue([3])
+    assert in_order([(10, early.take), (10, late.take)], [(4, 4)]) == [1, 2, 3, 4]
+
+
+def test_no_more_is_taken_than_may_wait_however_fast_others_come():
+    class Endless:
+        taken = 0
+
+        def take(self, most):
+            self.taken += most
+            return [(k, k) for k in range(most)]
+
+    few, many = Endless(), Endless()
+    found = in_order([(20, few.take), (2000, many.take)])
+    assert (few.taken, many.taken, len(found)) == (20, 2000, 2020)
+
+
+def test_messages_without_a_time_of_writing_are_not_held_back():
+    assert in_order([(10, lambda most: [(0, "c"), (0, "d")][:most])], [(5, "a"), (0, "b")])[:2] == ["b", "c"]
 
 
 def test_a_domain_that_is_none_is_refused():

@@ -90,6 +90,11 @@ def test_transitions_and_kills_in_any_order(middleware):
     assert found["refused"]
 
 
+def test_messages_that_wait_are_handed_on_in_the_order_in_which_they_were_published(middleware):
+    """Also those of different topics; the executor takes one of each topic in turn."""
+    assert ros_peer.ask("waiting", middleware, 300.0, count=300) == list(range(300))
+
+
 def test_damaged_messages_are_counted_and_the_node_goes_on(middleware):
     found = asked("damaged", middleware, count=3000, seed=1)
     assert found["sent"] == 3000, found["log"]

@@ -9,14 +9,14 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 from fgloc.errors import WireError
-from fgloc.live.wire.transport import Publication, Received, received_ns
+from fgloc.live.wire.transport import Publication, Received, in_order, read_depth, received_ns
 from fgloc.recording.messages import FieldLayout, Messages
 from fgloc.recording.reader import OWN
 
@@ -127,13 +127,8 @@ _LOOPBACK = """<CycloneDDS><Domain>
 """As ROS 2 does where it is set to stay on one machine (32: its rmw's limit of processes that find one another)."""
 
 _SENT_DEPTH = 200  # messages of a topic that wait for readers: 1 s of a fast sensor
-_READ_DEPTH = 2000  # messages of a topic that wait for the reading thread: 10 s of it, on a busy machine
-_LARGE_DEPTH = 20  # of large ones: 4 s of images at 5 Hz
-_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_BATCH = 200  # messages taken from a reader at once
 _LATCHED_DEPTH = 100  # messages of a topic that late readers get: each static transform may be one
 _BLOCK_S = 1.0  # a writer waits this long for a reader that has no more room
-_MOST_PASSES = 20  # over the readers before their messages are delivered
 _WAIT_S = 60.0  # the reading thread waits this long for messages, then again
 
 _domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
@@ -162,6 +157,20 @@ class _Reader:
     unread: Any  # the condition that it has unread messages
     publication: Publication
     on_sample: OnSample
+
+    @property
+    def depth(self) -> int:
+        """Number of messages that may wait in it."""
+        return read_depth(self.publication.message_type)
+
+    def take(self, most: int) -> Iterator[tuple[int, tuple[Sample, OnSample]]]:
+        """Messages that wait, each with its time of writing."""
+        topic, message_type = self.publication.topic, self.publication.message_type
+        for message in self.reader.take(most):
+            info = message.sample_info
+            if info.valid_data:
+                source_ns, publisher = info.source_timestamp, str(info.publication_handle)  # stands for a GUID
+                yield source_ns, (Sample(topic, message_type, message.cdr, source_ns, publisher), self.on_sample)
 
 
 class Writer:
@@ -343,7 +352,7 @@ class Participant:
         entity = self._topic(topic, message_type, types)
         qos = Qos(
             Policy.Reliability.Reliable(round(_BLOCK_S * 1e9)) if latched else Policy.Reliability.BestEffort,
-            Policy.History.KeepLast(_LARGE_DEPTH if message_type in _LARGE else _READ_DEPTH),
+            Policy.History.KeepLast(read_depth(message_type)),
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.DataRepresentation(use_cdrv0_representation=True),
             Policy.IgnoreLocal.Participant,  # what we publish is no input
@@ -386,25 +395,8 @@ class Participant:
             self._deliver()
 
     def _deliver(self) -> None:
-        """Deliver the messages that wait in all readers, in the order of writing.
-
-        Taken again until nothing more has come: a reader's newest message would else overtake older ones of readers
-        that were looked at before it.
-        """
-        found: list[tuple[int, int, Sample, OnSample]] = []
-        for _ in range(_MOST_PASSES):
-            before = len(found)
-            for one in self._readers:
-                topic, message_type = one.publication.topic, one.publication.message_type
-                for message in one.reader.take(_BATCH):
-                    if message.sample_info.valid_data:
-                        info = message.sample_info
-                        source_ns, publisher = info.source_timestamp, str(info.publication_handle)  # stands for a GUID
-                        sample = Sample(topic, message_type, message.cdr, source_ns, publisher)
-                        found.append((source_ns, len(found), sample, one.on_sample))
-            if len(found) == before:
-                break
-        for _, _, sample, on_sample in sorted(found, key=lambda item: item[:2]):
+        """Deliver the messages that wait in all readers, in the order of writing."""
+        for sample, on_sample in in_order([(one.depth, one.take) for one in self._readers]):
             try:
                 on_sample(sample)
             except Exception as error:  # raised by the next call; the other topics go on

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from operator import itemgetter
+from typing import Any, Protocol, TypeVar
 
+_READ_DEPTH = 2000  # messages of a topic that wait to be read: 10 s of it, on a busy machine
+_LARGE_DEPTH = 20  # of large ones: 4 s of images at 5 Hz
+_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_BATCH = 200  # messages taken from a queue at once
+_MOST_PASSES = 20  # over the queues before what they held is handed on
 _ALIKE_NS = 1_000_000_000  # clocks closer than this are one clock: ROS counts on it between machines
 
 
@@ -96,3 +102,36 @@ def received_ns(source_ns: int, now_ns: int, simulated: bool) -> int:
     apart = abs(source_ns - now_ns)
     ours = apart <= abs(source_ns - time.time_ns()) if simulated else apart < _ALIKE_NS
     return source_ns if ours else now_ns
+
+
+def read_depth(message_type: str) -> int:
+    """Number of a topic's messages that may wait to be read."""
+    return _LARGE_DEPTH if message_type in _LARGE else _READ_DEPTH
+
+
+T = TypeVar("T")
+Take = Callable[[int], Iterable[tuple[int, T]]]
+"""Takes at most so many messages from a queue, the oldest first, each with its time of writing."""
+
+
+def in_order(queues: Sequence[tuple[int, Take[T]]], first: Iterable[tuple[int, T]] = ()) -> list[T]:
+    """What waits in several queues, in the order of writing; what has no time of writing (0) comes before the rest.
+
+    They are looked at again until nothing more has come: a queue's newest message would else overtake older ones of
+    queues that were looked at before it.
+
+    Args:
+        queues: each with the number of messages that may wait in it; no more are taken.
+        first: messages that were taken before.
+    """
+    found = [*first]
+    rooms = [depth for depth, _ in queues]
+    for _ in range(_MOST_PASSES):
+        before = len(found)
+        for k, (_, take) in enumerate(queues):
+            taken = [*take(min(_BATCH, rooms[k]))] if rooms[k] else []
+            rooms[k] -= len(taken)
+            found += taken
+        if len(found) == before:
+            break
+    return [message for _, message in sorted(found, key=itemgetter(0))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,15 +19,12 @@ from rosidl_runtime_py.utilities import get_message
 
 from fgloc.errors import WireError
 from fgloc.live.wire.outputs import Outputs
-from fgloc.live.wire.transport import Publication, received_ns
+from fgloc.live.wire.transport import Publication, in_order, read_depth, received_ns
 from fgloc.recording.messages import Messages
 from fgloc.recording.reader import TF_TYPES
 
 _CREATE_S = 0.05  # time between two looks for subscriptions to be made, in the thread of the executor
 _SENT_DEPTH = 20  # messages of a topic that wait for readers
-_READ_DEPTH = 2000  # messages of a topic that wait for the executor: 10 s of it, on a busy machine
-_LARGE_DEPTH = 20  # of large ones: 4 s of images at 5 Hz
-_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _LATCHED_DEPTH = 100
 _DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
@@ -42,6 +39,39 @@ class Heard:
     source_ns: int
     messages: Messages | None = None
     publisher: str = ""  # rclpy does not say who
+
+
+class _Reader:
+    """Subscription of one topic, with the function that its messages are handed to.
+
+    Attributes:
+        depth: number of messages that may wait in it.
+        subscription: rclpy's.
+    """
+
+    def __init__(
+        self, topic: str, message_type: str, on_message: Callable[[Any], None], messages: Messages | None, depth: int
+    ) -> None:
+        self._topic, self._type, self._messages = topic, message_type, messages
+        self._on_message = on_message
+        self.depth = depth
+        self.subscription: Any = None
+
+    def heard(self, message: Any, info: Mapping[str, int]) -> tuple[int, tuple[Heard, Callable[[Any], None]]]:
+        """One message as rclpy has it, with its time of writing; 0: the middleware does not say."""
+        stamp = info["source_timestamp"]
+        source_ns = stamp or time.time_ns()
+        return stamp, (Heard(self._topic, self._type, message, source_ns, self._messages), self._on_message)
+
+    def take(self, most: int) -> Iterator[tuple[int, tuple[Heard, Callable[[Any], None]]]]:
+        """Messages that wait, as rclpy's executor takes them one by one."""
+        one = self.subscription
+        with one.handle:
+            for _ in range(most):
+                taken = one.handle.take_message(one.msg_type, one.raw)
+                if taken is None:
+                    return
+                yield self.heard(*taken)
 
 
 class _NodeClock:
@@ -93,8 +123,8 @@ class RosTransport:
         self._named = {*named, self.full_name("/tf"), self.full_name("/tf_static")}
         self._publishers: dict[str, tuple[Any, _Publisher]] = {}
         self._wanted: list[tuple[str, str, Callable[[Any], None], bool]] = []
-        self._subscriptions: list[Any] = []
-        self._ending: list[Any] = []
+        self._readers: list[_Reader] = []
+        self._ending: list[_Reader] = []
         self._failure: Exception | None = None
         self._unreadable: set[str] = set()  # topics that were named for that
         self._lost: Counter[str] = Counter()  # messages, by topic
@@ -113,14 +143,14 @@ class RosTransport:
     def _end(self) -> None:
         with self._lock:
             ending, self._ending = self._ending, []
-        for subscription in ending:
-            self._node.destroy_subscription(subscription)
+        for reader in ending:
+            self._node.destroy_subscription(reader.subscription)
 
     def forget(self) -> None:
         """Let the subscriptions end soon; may be called in any thread."""
         with self._lock:
             self._wanted.clear()
-            self._ending, self._subscriptions = [*self._ending, *self._subscriptions], []
+            self._ending, self._readers = [*self._ending, *self._readers], []
 
     def close(self) -> None:
         """End everything."""
@@ -222,30 +252,27 @@ class RosTransport:
             wanted, self._wanted = self._wanted, []
         for topic, message_type, on_message, latched in wanted:
             try:
-                subscription = self._subscription(topic, message_type, on_message, latched)
+                reader = self._reader(topic, message_type, on_message, latched)
             except Exception as error:  # the parameters of its QoS are none
                 self._node.get_logger().error(f"{topic} ({message_type}) cannot be read: {error}")
                 continue
             with self._lock:
-                self._subscriptions.append(subscription)
+                self._readers.append(reader)
 
-    def _subscription(self, topic: str, message_type: str, on_message: Callable[[Any], None], latched: bool) -> Any:
-        depth = _LARGE_DEPTH if message_type in _LARGE else _LATCHED_DEPTH if latched else _READ_DEPTH
+    def _reader(self, topic: str, message_type: str, on_message: Callable[[Any], None], latched: bool) -> _Reader:
+        depth = _LATCHED_DEPTH if latched else read_depth(message_type)
         reliability = ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT
         messages = self._messages_of(topic, message_type)
+        reader = _Reader(topic, message_type, on_message, messages, depth)
 
         def lose(info: Any) -> None:
             with self._lock:
                 self._lost[topic] += info.total_count_change
 
         def deliver(message: Any, info: Mapping[str, int]) -> None:
-            source_ns = info["source_timestamp"] or time.time_ns()  # 0: the middleware does not say
-            try:
-                on_message(Heard(topic, message_type, message, source_ns, messages))
-            except Exception as error:  # raised by the next look for topics: the run begins again, the executor goes on
-                self._failure = error
+            self._deliver(reader, message, info)
 
-        return self._node.create_subscription(
+        reader.subscription = self._node.create_subscription(
             get_message(message_type),
             topic,
             deliver,
@@ -254,6 +281,20 @@ class RosTransport:
             event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
             raw=messages is not None,
         )
+        return reader
+
+    def _deliver(self, reader: _Reader, message: Any, info: Mapping[str, int]) -> None:
+        """Hand on a message that the executor has taken, and those that wait, in the order of writing.
+
+        The executor takes one message of each topic in turn, whichever is older.
+        """
+        with self._lock:
+            queues = [(one.depth, one.take) for one in self._readers]
+        for heard, on_message in in_order(queues, [reader.heard(message, info)]):
+            try:
+                on_message(heard)
+            except Exception as error:  # raised by the next look for topics: the run begins again, the executor goes on
+                self._failure = error
 
     def _messages_of(self, topic: str, message_type: str) -> Messages | None:
         """Types of fgloc's that read a topic's messages; None: it has none like its publishers', rclpy reads them.
