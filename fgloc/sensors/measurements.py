@@ -209,24 +209,83 @@ class LandmarkSighting(LandmarkMeasurement, Protocol):
         ...
 
 
+# --- What sightings of landmarks have in common -----------------------------------------------------------------------
+
+
+class _OfLandmark:
+    """Properties that are alike for all sightings of landmarks of the map."""
+
+    __slots__ = ()
+
+    of_landmark: ClassVar[bool] = True
+    is_point: ClassVar[bool] = False
+    in_pixels: ClassVar[bool] = False
+    observes_yaw: ClassVar[bool] = True
+    bias_key: ClassVar[None] = None
+
+    landmark_id: int
+
+    @property
+    def unnamed(self) -> bool:
+        """Whether the sensor does not say of which landmark it is."""
+        return False
+
+    @property
+    def row_id(self) -> int:
+        """Id of the landmark."""
+        return self.landmark_id
+
+    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """No alternatives but other ids; see `misread`."""
+        return ()
+
+    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
+        """No other readings: the sensor's own association is taken as it is."""
+        return ()
+
+
+class _InPlane(_OfLandmark):
+    """Likewise of those in the plane of the base, with a covariance of their own."""
+
+    __slots__ = ()
+
+    model: ClassVar[Model] = Model.PLANAR
+    counted_as: ClassVar[str] = "sightings"
+    errors_repeat: ClassVar[bool] = True
+
+    cov: FloatArray
+
+    @property
+    def information(self) -> float:
+        """Weight in comparison with others of its kind."""
+        return 1.0 / float(np.trace(self.cov[:2, :2]))
+
+    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
+        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
+        return replace(self, twist=twist, offset_s=offset_s)  # type: ignore[type-var]
+
+    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
+        """The sighting itself: it is taken to be in the plane."""
+        return self
+
+    def scaled(self, factor: float) -> Self:
+        """Copy with the covariance multiplied by a factor."""
+        return replace(self, cov=self.cov * factor)  # type: ignore[type-var]
+
+
 # --- Corners of a marker ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PixelMeasurement:
+class PixelMeasurement(_OfLandmark):
     """A square landmark in an image: its four corners, rid of what Cal3DS2 cannot model, with isotropic noise."""
 
     model: ClassVar[Model] = Model.CORNERS
     cov: ClassVar[None] = None
-    of_landmark: ClassVar[bool] = True
-    unnamed: ClassVar[bool] = False
-    is_point: ClassVar[bool] = False
     gives_pose: ClassVar[bool] = True
     in_pixels: ClassVar[bool] = True
     errors_repeat: ClassVar[bool] = False
-    observes_yaw: ClassVar[bool] = True
     variable_dof: ClassVar[int] = 0
-    bias_key: ClassVar[None] = None
     dof: ClassVar[int] = 8
 
     stamp_ns: int
@@ -254,11 +313,6 @@ class PixelMeasurement:
     def counted_as(self) -> str:
         """Name under which it is counted if it is rejected."""
         return camera_role(self.camera.name, "sightings")
-
-    @property
-    def row_id(self) -> int:
-        """Id of the landmark."""
-        return self.landmark_id
 
     @property
     def information(self) -> float:
@@ -297,10 +351,6 @@ class PixelMeasurement:
     def landmark_from(self, pose: FloatArray) -> None:
         """None: markers need a known map to be seen by their corners."""
 
-    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No alternatives but other ids; see `misread`."""
-        return ()
-
     def misread(self, ids: IntArray, places: FloatArray) -> list[PixelMeasurement]:
         """The same corners with other ids, of markers whose middle lies in about the same direction."""
         T, K = self.camera.T_base_cam, self.camera.K
@@ -328,23 +378,16 @@ class PixelMeasurement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PointMeasurement:
+class PointMeasurement(_InPlane):
     """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out).
 
     With the id `UNNAMED` it is of any point of the map: which one the predicted pose tells.
     """
 
-    model: ClassVar[Model] = Model.PLANAR
     row_kind: ClassVar[str] = "range_bearing"
-    counted_as: ClassVar[str] = "sightings"
-    of_landmark: ClassVar[bool] = True
     is_point: ClassVar[bool] = True
     gives_pose: ClassVar[bool] = False
-    in_pixels: ClassVar[bool] = False
-    errors_repeat: ClassVar[bool] = True
-    observes_yaw: ClassVar[bool] = True
     variable_dof: ClassVar[int] = 2
-    bias_key: ClassVar[None] = None
     dof: ClassVar[int] = 2
 
     stamp_ns: int
@@ -378,24 +421,6 @@ class PointMeasurement:
         """Position in the base frame ``(2,)`` [m]."""
         return np.array([self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)])
 
-    @property
-    def row_id(self) -> int:
-        """Id of the landmark."""
-        return self.landmark_id
-
-    @property
-    def information(self) -> float:
-        """Weight in comparison with others of its kind."""
-        return 1.0 / float(np.trace(self.cov[:2, :2]))
-
-    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
-        return replace(self, twist=twist, offset_s=offset_s)
-
-    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """The sighting itself: ranges are taken to be in the plane."""
-        return self
-
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
         ad = se2.adjoint(motion)
@@ -405,10 +430,6 @@ class PointMeasurement:
         added = _bearing_range_cov(cov, motion, np.array([x, y]), r, bearing)
         return replace(self, range_m=r, bearing_rad=bearing, cov=self.cov + added, twist=ad @ self.twist)
 
-    def scaled(self, factor: float) -> Self:
-        """Copy with the covariance multiplied by a factor."""
-        return replace(self, cov=self.cov * factor)
-
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
         """No poses: those on a ring are searched among hypotheses, see `fgloc.estimation.beacons`."""
         return ()
@@ -417,14 +438,6 @@ class PointMeasurement:
         """Point ``(2,)`` as seen from a pose."""
         local = [self.range_m * np.cos(self.bearing_rad), self.range_m * np.sin(self.bearing_rad), 0.0]
         return se2.compose(pose, local)[:2]
-
-    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No alternatives."""
-        return ()
-
-    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No other readings: the sensor's own association is taken as it is."""
-        return ()
 
     def in_base(self) -> tuple[FloatArray, FloatArray]:
         """Point ``(2,)`` in the base frame, and the matrix ``(2, 2)`` that makes its error white."""
@@ -472,21 +485,12 @@ def _in_sensor(x: float, y: float, T_base_sensor: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FrameMeasurement:
+class FrameMeasurement(_InPlane):
     """A landmark with its yaw: planar pose ``T_base_marker`` (see Landmark.planar), right-perturbation covariance."""
 
-    model: ClassVar[Model] = Model.PLANAR
     row_kind: ClassVar[str] = "marker_pose"
-    counted_as: ClassVar[str] = "sightings"
-    of_landmark: ClassVar[bool] = True
-    unnamed: ClassVar[bool] = False
-    is_point: ClassVar[bool] = False
     gives_pose: ClassVar[bool] = True
-    in_pixels: ClassVar[bool] = False
-    errors_repeat: ClassVar[bool] = True
-    observes_yaw: ClassVar[bool] = True
     variable_dof: ClassVar[int] = 3
-    bias_key: ClassVar[None] = None
     dof: ClassVar[int] = 3
 
     stamp_ns: int
@@ -497,33 +501,11 @@ class FrameMeasurement:
     offset_s: float = 0.0
     cauchy_k: float = 3.0  # as in PixelMeasurement
 
-    @property
-    def row_id(self) -> int:
-        """Id of the landmark."""
-        return self.landmark_id
-
-    @property
-    def information(self) -> float:
-        """Weight in comparison with others of its kind."""
-        return 1.0 / float(np.trace(self.cov[:2, :2]))
-
-    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
-        return replace(self, twist=twist, offset_s=offset_s)
-
-    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """The sighting itself: poses are taken to be in the plane."""
-        return self
-
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
         pose = se2.compose(motion, self.pose)
         moved = se2.compose_cov(cov, self.pose, self.cov)
         return replace(self, pose=pose, cov=moved, twist=se2.adjoint(motion) @ self.twist)
-
-    def scaled(self, factor: float) -> Self:
-        """Copy with the covariance multiplied by a factor."""
-        return replace(self, cov=self.cov * factor)
 
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
         """The pose of the base that explains it."""
@@ -532,14 +514,6 @@ class FrameMeasurement:
     def landmark_from(self, pose: FloatArray) -> FloatArray:
         """Pose ``(3,)`` of the marker as seen from a pose of the base."""
         return se2.compose(pose, self.pose)
-
-    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No alternatives."""
-        return ()
-
-    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No other readings: the detector's association is taken as it is."""
-        return ()
 
     def in_base(self) -> tuple[FloatArray, FloatArray]:
         """Pose ``(3,)``, and the matrix ``(3, 3)`` that makes its error in the base's axes white."""
