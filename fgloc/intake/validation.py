@@ -255,7 +255,7 @@ class EventValidator:
         if frames != topic.other and topic.votes == 0:
             topic.other = frames
         topic.votes += 1 if frames == topic.other else -1
-        if topic.votes >= _OTHER_FRAMES and event.received_ns - topic.used_ns >= _SILENT_NS:
+        if topic.votes >= _OTHER_FRAMES and abs(event.received_ns - topic.used_ns) >= _SILENT_NS:
             return ""
         topic.stray += 1
         return "frame"

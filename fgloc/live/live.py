@@ -32,9 +32,9 @@ from fgloc.types import Camera, CameraInfoEvent, Estimate, Event, FloatArray, La
 # --- Reception: rates and delays by topic, publishers, and clocks that were reset -------------------------------------
 
 _SILENT_NS = 2_000_000_000  # a topic that others outlive by this long is reported
-_SUCCESSION_NS = (
-    1_000_000_000  # a publisher that sends nothing for this long has ended; another one of the topic is used
-)
+# A publisher that sends nothing for this long has ended, and so has one before the clock of all was set back by as much:
+# another one of the topic is used
+_SUCCESSION_NS = 1_000_000_000
 
 
 _MOST_TOPICS = 100  # that are received
@@ -95,7 +95,7 @@ class _Publisher:
 
     def has_the_topic(self, name: str, received_ns: int) -> bool:
         """Whether a message is of that publisher, or of one that replaces it after a silence."""
-        if name != self.name and received_ns - self.received_ns < _SUCCESSION_NS:
+        if name != self.name and abs(received_ns - self.received_ns) < _SUCCESSION_NS:
             return False
         self.name, self.received_ns = name, received_ns
         return True

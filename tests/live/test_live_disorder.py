@@ -149,6 +149,24 @@ def test_another_publisher_takes_over_once_the_first_is_gone(world):
     assert status.dropped["odometry"] == pytest.approx(20, abs=1)  # of the second before that was clear
 
 
+def test_a_player_that_is_started_again_is_heard_at_once(world):
+    """The clock of all starts over with it, by more than the silence that ends a publisher."""
+
+    def earlier(event, ns):
+        return dataclasses.replace(event, stamp_ns=event.stamp_ns - ns, received_ns=event.received_ns - ns)
+
+    events = list(world.events())
+    with live_in(world) as live:
+        for event in [e for e in events if after(e) < 6.0]:
+            live.push(event, "first")
+        for event in [e for e in events if after(e) >= 6.0]:
+            live.push(earlier(event, 5 * SECOND), "second")
+        assert live.wait(60.0)
+        status = live.status()
+    assert not status.dropped.get("odometry")
+    assert not [n for n in status.notes if "two publishers" in n]
+
+
 def test_a_second_topic_of_a_role_is_not_mixed_in(world, orderly):
     def twin(event):
         return dataclasses.replace(event, topic="/other_odom", linear=-event.linear, stamp_ns=event.stamp_ns + 1)
