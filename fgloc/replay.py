@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from fgloc.types import (
     Decision,
     Estimate,
     Event,
+    FloatArray,
     Ground,
     LandmarkMap,
     RawEvent,
@@ -306,11 +307,11 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
             result.poses, contradiction.rivals or ()
         )  # a view of `ground_covs`, where there is one
         installed = as_given(installed, factors.installation, contradiction.names)
+    added = log.added_covs()
+    grounds = _ground(solver, result, added)
     estimates = [
-        Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + frame.added_cov, float(pose[2])), frame.mode, (), ground)
-        for frame, pose, cov, ground in zip(
-            solver.frames, result.poses, result.covs, _ground(solver, result), strict=True
-        )
+        Estimate(frame.stamp_ns, pose, se2.rotate_cov(cov + more, float(pose[2])), frame.mode, (), ground)
+        for frame, pose, cov, more, ground in zip(solver.frames, result.poses, result.covs, added, grounds, strict=True)
     ]
     landmarks = parts.landmark_map
     if landmarks is None and result.landmarks:
@@ -321,14 +322,16 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     )
 
 
-def _ground(solver: BatchSmoother, result: Smoothed) -> Iterator[Ground | None]:
+def _ground(solver: BatchSmoother, result: Smoothed, added: Sequence[FloatArray]) -> Iterator[Ground | None]:
     """Ground of each keyframe; None: the floor is flat."""
     if result.ground is None or result.ground_covs is None:
         yield from (None for _ in solver.frames)
         return
-    for frame, pose, ground, cov in zip(solver.frames, result.poses, result.ground, result.ground_covs, strict=True):
+    for frame, pose, ground, cov, more in zip(
+        solver.frames, result.poses, result.ground, result.ground_covs, added, strict=True
+    ):
         whole = cov.copy()
-        whole[:3, :3] += frame.added_cov
+        whole[:3, :3] += more
         found = ground_at(ground, whole, float(pose[2]))
         by_clock = frame.ground_clock_cov
         yield found if by_clock is None else replace(found, cov=found.cov + by_clock)

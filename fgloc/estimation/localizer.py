@@ -363,13 +363,17 @@ class Recorder:
         twist = self._compensation.twist(step, step.stamp_ns)
         by_clock = np.asarray(np.outer(twist, twist) * self._clock_sigma_s**2)
         carried, around = tracking.kidnapped(self._sightings.contradicting, belief)
-        frame.added_cov = by_clock + carried * around  # of a mixture of two Gaussians, the second one wide
+        frame.added_cov, frame.carried_cov = (
+            by_clock,
+            carried * around,
+        )  # a mixture of two Gaussians, the second one wide
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + tracking.lost_cov(belief)
         modes = mode_decisions(frame.k, step.stamp_ns, frame.mode, tracking.since_fix_s, self._dead_reckoning_after_s)
         before, self._clock_jumps = [*self._clock_jumps, *self._motion.take_signs()], []
-        cov = se2.rotate_cov(belief.cov + frame.added_cov, float(belief.pose[2]))
-        ground = spatial(belief, self._installation, frame.added_cov)
+        added = frame.added_cov + frame.carried_cov
+        cov = se2.rotate_cov(belief.cov + added, float(belief.pose[2]))
+        ground = spatial(belief, self._installation, added)
         if ground is not None:
             frame.ground_clock_cov = self._ground_by_clock(step, ground)
             ground = replace(ground, cov=ground.cov + frame.ground_clock_cov)
@@ -383,7 +387,7 @@ class Recorder:
             known = seen.predicted.installation or self._estimator.installed
             fix = Fix(seen.predicted, known, seen.lines, step.dt)
         protection = self._levels.of(
-            belief.cov + frame.added_cov - carried * around,
+            belief.cov + frame.added_cov,
             twist,
             tracking.since_fix_s,
             checked,
@@ -426,7 +430,10 @@ class Recorder:
             frame.mode = mode
         if mode is not Mode.LOST:
             return [replace(e, mode=mode) for e in estimates]
-        covs = {f.stamp_ns: se2.rotate_cov(f.belief.cov + f.added_cov, float(f.belief.pose[2])) for f in frames}
+        covs = {
+            f.stamp_ns: se2.rotate_cov(f.belief.cov + f.added_cov + f.carried_cov, float(f.belief.pose[2]))
+            for f in frames
+        }
         return [_with_cov(replace(e, mode=mode), covs.get(e.stamp_ns)) for e in estimates]
 
 

@@ -57,6 +57,7 @@ class Keyframe:
     readings: MotionReadings = field(default_factory=MotionReadings)  # what the motions were made of ...
     budget: NoiseBudget = field(default_factory=NoiseBudget)  # ... and with which noise
     added_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # to that of the pose when it is reported
+    carried_cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))  # likewise, unless a later fix agrees
     ground_clock_cov: FloatArray | None = None  # (6, 6) as `added_cov`, of x, y, z, roll, pitch, yaw
     ground: FloatArray | None = None  # (3,) height, roll and pitch, as of the belief; on uneven ground
 
@@ -88,6 +89,15 @@ class MeasurementLog:
             if self.keyframes[oldest].elapsed_s >= horizon:
                 break
             del self.keyframes[oldest]
+
+    def added_covs(self) -> list[FloatArray]:
+        """Covariances ``(3, 3)`` to add to the smoothed poses; that a robot was carried is not once a fix agrees."""
+        added, agreed = [], False
+        for frame in reversed(self.keyframes.values()):
+            agreed = agreed or bool(frame.sightings)
+            added.append(frame.added_cov if agreed else frame.added_cov + frame.carried_cov)
+            agreed = agreed and frame.prior is None
+        return added[::-1]
 
     def since(self, elapsed_s: float) -> Iterator[Keyframe]:
         """Keyframes not older than the given time of the estimator's own clock."""

@@ -32,8 +32,8 @@ from fgloc.types import Camera, CameraInfoEvent, Estimate, Event, FloatArray, La
 # --- Reception: rates and delays by topic, publishers, and clocks that were reset -------------------------------------
 
 _SILENT_NS = 2_000_000_000  # a topic that others outlive by this long is reported
-# A publisher that sends nothing for this long has ended, and so has one before the clock of all was set back by as much:
-# another one of the topic is used
+# A publisher that sends nothing for this long has ended, and so has one from before the clock was set back by as much:
+# another one of the topic is used.
 _SUCCESSION_NS = 1_000_000_000
 
 
