@@ -16,13 +16,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from scipy import stats
 
 from fgloc.ablation.jobs import Job, Record, code_hash
 from fgloc.ablation.suite import NOTHING, Cell, Suite
 from fgloc.config import files_of
 from fgloc.evaluation.report import embedded, page
-from fgloc.evaluation.style import BLUE, DPI, GREEN, NORMAL, SMALL, WIDTH, plain_label, png, tidy
+from fgloc.evaluation.style import BLUE, DPI, GREEN, NORMAL, SMALL, WIDTH, Format, image_of, plain_label, png, tidy
 from fgloc.files.atomic import atomic_folder
 from fgloc.files.outputs import sha256_of, write_json, write_text
 from fgloc.stats import rounded
@@ -290,7 +291,7 @@ def _csv(head: Sequence[str], content: Iterable[Sequence[object]]) -> str:
     return buffer.getvalue()
 
 
-# --- Pictures: error over severity, and the worst track of each failure -----------------------------------------------
+# --- Pictures: error of each failure, over its severity, and its worst track ------------------------------------------
 
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#555555")  # Okabe and Ito
 _COLUMNS = 3
@@ -324,6 +325,44 @@ class Tracks:
     title: str
     estimate: Sequence[tuple[float, float]]
     truth: Sequence[tuple[float, float]]
+
+
+def plot_failures(suite: Suite, entries: Sequence[Entry]) -> Figure:
+    """Error of each failure, one below the other, by variant: mean, and every run as a dot; logarithmic."""
+    shown = [(name, severity, _row_label(suite, name, severity)) for name, severity in rows(suite)]
+    names = [variant.name for variant in suite.variants]
+    height = (0.09 + 0.09 * len(names)) * len(shown) + 0.6 + 0.18 * math.ceil(len(names) / 3)
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
+    ax = figure.add_subplot()
+    tidy(ax)
+    for i, name in enumerate(names):
+        color, offset = _COLORS[i % len(_COLORS)], (i - 0.5 * (len(names) - 1)) * 0.6 / len(names)
+        found = {(e.failure, e.severity): e for e in entries if e.variant == name and e.metric == ATE and e.values}
+        at = [(row + offset, found[key[:2]]) for row, key in enumerate(shown) if key[:2] in found]
+        single = [(value, y) for y, e in at for value in e.values]
+        ax.plot(*np.array(single).reshape(-1, 2).T, ".", color=color, ms=3, alpha=0.5)
+        ax.plot(
+            [float(np.mean(e.values)) for _, e in at],
+            [y for y, _ in at],
+            "o",
+            color=color,
+            ms=4.5,
+            label=plain_label(name),
+        )
+    ax.set_yticks(range(len(shown)), [plain_label(label) for *_, label in shown], fontsize=SMALL)
+    ax.invert_yaxis()
+    ax.set_xscale("log")
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.set_xlabel(ATE.label, fontsize=SMALL)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=SMALL, frameon=False)
+    return figure
+
+
+def _row_label(suite: Suite, failure: str, severity: float | None) -> str:
+    units = {f.name: f.severity.unit for f in suite.failures if f.severity is not None}
+    return failure if severity is None else f"{failure} {severity:g} {units[failure]}".rstrip()
 
 
 def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
@@ -406,9 +445,22 @@ _SEVERITY = (
 
 
 def write_report(
-    suite: Suite, jobs: Sequence[Job], records: Mapping[str, Record], out: Path, command: str
+    suite: Suite,
+    jobs: Sequence[Job],
+    records: Mapping[str, Record],
+    out: Path,
+    command: str,
+    figures: Sequence[Format] = (),
 ) -> list[str]:
     """Write ``report.html``, ``matrix.csv``, ``runs.csv`` and ``ablation.json``; return a sentence per failure.
+
+    Args:
+        suite: what was asked for.
+        jobs: its runs.
+        records: their results, by key.
+        out: folder.
+        command: as it was typed.
+        figures: formats in which the figures are written too.
 
     Raises:
         OutputError: the folder cannot be written; an old report is kept.
@@ -428,8 +480,25 @@ def write_report(
         write_text(stage / "matrix.csv", matrix_csv(entries))
         write_text(stage / "runs.csv", runs_csv(runs))
         write_json(stage / "ablation.json", _as_json(runs, entries, sentences, _worths(suite, runs), provenance))
-        write_text(stage / "report.html", _page(suite, runs, entries, sentences, provenance))
+        drawn = _drawn(suite, runs, entries)
+        write_text(stage / "report.html", _page(suite, runs, entries, sentences, provenance, drawn))
+        for form in figures:
+            for name, (_, figure, _) in drawn.items():
+                (stage / f"{name}.{form}").write_bytes(image_of(figure, form))
     return sentences
+
+
+def _drawn(suite: Suite, runs: Sequence[Run], entries: Sequence[Entry]) -> dict[str, tuple[str, Figure, str]]:
+    """Heading, figure and caption, by the name of its file."""
+    drawn = {}
+    if any(e.values for e in entries if e.metric == ATE):
+        drawn["failures"] = ("Failures", plot_failures(suite, entries), f"{ATE.label}: means, and every run as a dot.")
+    if curves := _curves(suite, entries):
+        drawn["severity"] = ("Severity", plot_severity(curves, ATE.label), _SEVERITY)
+    if tracks := _tracks(suite, runs):
+        caption = f"The run of '{suite.variants[0].name}' with the largest error: estimate over the gray truth [m]."
+        drawn["worst"] = ("Worst cases", plot_tracks(tracks), caption)
+    return drawn
 
 
 def failed(jobs: Sequence[Job], records: Mapping[str, Record]) -> list[Run]:
@@ -489,7 +558,12 @@ def _as_json(
 
 
 def _page(
-    suite: Suite, runs: Sequence[Run], entries: Sequence[Entry], sentences: Sequence[str], provenance: Mapping[str, Any]
+    suite: Suite,
+    runs: Sequence[Run],
+    entries: Sequence[Entry],
+    sentences: Sequence[str],
+    provenance: Mapping[str, Any],
+    drawn: Mapping[str, tuple[str, Figure, str]],
 ) -> str:
     bad = [run for run in runs if run.record.outcome != "done"]
     count = (
@@ -497,12 +571,7 @@ def _page(
         f"{len(suite.failures)} failures, {len(suite.seeds)} seeds; {len(bad)} without a result."
     )
     head = ("failure", "severity", *(v.name for v in suite.variants))
-    pictures = []
-    if curves := _curves(suite, entries):
-        pictures.append(("Severity", embedded(png(plot_severity(curves, ATE.label))), _SEVERITY))
-    if tracks := _tracks(suite, runs):
-        caption = f"The run of '{suite.variants[0].name}' with the largest error: estimate over the gray truth [m]."
-        pictures.append(("Worst cases", embedded(png(plot_tracks(tracks))), caption))
+    pictures = [(heading, embedded(png(figure)), caption) for heading, figure, caption in drawn.values()]
     return page(
         "ablation.html",
         title=suite.title,

@@ -231,6 +231,7 @@ def ablate(
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     retry: Annotated[bool, typer.Option("--retry", help="run jobs that gave no result once more")] = False,
+    figures: FiguresOption = None,
 ) -> None:
     """Tell what the failure of each sensor costs. The same command goes on with a killed sweep."""
     from fgloc.ablation.jobs import make_jobs, only_sweep
@@ -239,6 +240,7 @@ def ablate(
     from fgloc.ablation.sweep import sweep
 
     need("sweep", "fgloc ablate")
+    forms = figure_formats(figures)
     check_out(out)
     plan = load_suite(suite)
     jobs = make_jobs(expand(plan, suite.parent))
@@ -246,7 +248,7 @@ def ablate(
     with only_sweep(out):
         with kept_on_interrupt(kept), jobs_bar("runs") as show:
             records = sweep(jobs, out, workers, scheduler, retry, show)
-        sentences = write_report(plan, jobs, records, out, typed())
+        sentences = write_report(plan, jobs, records, out, typed(), forms)
     for sentence in sentences:
         say(sentence)
     without = failed(jobs, records)

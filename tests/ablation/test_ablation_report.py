@@ -199,11 +199,12 @@ def test_worst_case_is_the_largest_error(bag):
 def test_report_files_agree(bag, tmp_path):
     out = tmp_path / "out"
     jobs, records = made(bag)
-    sentences = write_report(SUITE, jobs, records, out, "fgloc ablate x.yaml")
+    sentences = write_report(SUITE, jobs, records, out, "fgloc ablate x.yaml", ("pdf", "svg"))
+    assert {"failures.pdf", "failures.svg", "worst.pdf"} <= {file.name for file in out.iterdir()}
     page = (out / "report.html").read_text()
     assert "Blind &amp; dead" in page
     assert "<no> pose" not in page
-    assert page.count("data:image/png") == 2
+    assert page.count("data:image/png") == 3
     assert page.count("EstimatorError: &lt;no&gt; pose") == 1
     assert "http" not in page.replace("http-equiv", "")
     content = json.loads((out / "ablation.json").read_text())
