@@ -170,7 +170,8 @@ def inspect_all(path: Path, map_path: Path | None, config: Config) -> RecordingI
         except FglocError as error:
             return replace(info, problems=(str(error), *info.problems))
     named = list(search.findings) or _other_ids(info.marker_ids, setup.landmark_map)
-    return replace(info, found=ordered([*named, *info.found]))
+    of_map = () if setup.landmark_map is None else setup.landmark_map.notes
+    return replace(info, found=ordered([*named, *info.found]), notes=(*of_map, *info.notes))
 
 
 def _other_ids(seen: Collection[int], landmark_map: LandmarkMap | None) -> list[Finding]:

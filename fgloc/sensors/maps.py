@@ -27,7 +27,7 @@ from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
 from fgloc.frames import quaternion_matrix, rotation_of, rpy_matrix
 from fgloc.sensors.markers.detector import load_dictionary
-from fgloc.types import MAX_LANDMARK_ID, FloatArray, Landmark, LandmarkMap
+from fgloc.types import MAX_LANDMARK_ID, FloatArray, Grave, Landmark, LandmarkMap
 
 KEYS = ("cov", "sigma_m", "sigma_rad")
 _OF = {2: "x, y", 3: "x, y, z", 6: "x, y, z and the rotation about the marker's axes"}
@@ -268,10 +268,11 @@ def _columns(path: Path, root: Item, landmarks: Item, builder: _Builder) -> Land
     if heights is not None:
         columns["z"] = heights.entries()
     count = min(len(c) for c in columns.values())
-    notes = []
+    notes: list[str] = []
     if any(len(c) != count for c in columns.values()):
         lengths = ", ".join(f"{len(c)} {key}" for key, c in columns.items())
-        notes.append(f"{path}: lists of unequal length ({lengths}); the first {count} landmarks are used.")
+        text = f"{path}: lists of unequal length ({lengths}); the first {count} of each are taken for each other's."
+        notes.append(Grave(f"{text} Give each landmark its own entry."))
     for k in range(count):
         xyz = [columns[key][k].number() if key in columns else 0.0 for key in ("x", "y", "z")]
         builder.add(columns["id"][k], columns["id"][k], np.array(xyz))
