@@ -47,7 +47,7 @@ def calibrate(
     Raises:
         FglocError: a recording cannot be used, or holds no wheels or no sightings.
     """
-    if all(map(partial(_only_truth, config=config), bags)):
+    if all(map(partial(only_truth, config=config), bags)):
         return calibrate_by_truth(bags, config)
     now = config
     for _ in range(_ROUNDS):
@@ -60,7 +60,7 @@ def calibrate(
     return with_settings(config, settings), settings
 
 
-def _only_truth(bag: Path, config: Config) -> bool:
+def only_truth(bag: Path, config: Config) -> bool:
     """Whether nothing but a truth tells where the robot was."""
     with open_recording(bag, config.recording) as recording:
         seeing = {"image", "sightings", *(s.role for sensor in registry.sensors() for s in sensor.streams)}

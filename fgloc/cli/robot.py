@@ -235,8 +235,13 @@ def _distance(text: str) -> Distance:
 # --- calibrate --------------------------------------------------------------------------------------------------------
 
 
-def _bending(bags: Sequence[Path], map_file: Path | None, config: Config, fitted: Set[str]) -> list[str]:
-    """Mistakes of the set-up that no fitted constant can undo, where no map tells them from what the wheels are off."""
+def _bending(bags: Sequence[Path], map_file: Path | None, before: Config, after: Config, fitted: Set[str]) -> list[str]:
+    """Mistakes of the set-up that no fitted constant can undo, where no map tells them from what the wheels are off.
+
+    Landmarks agree with whatever the wheels were fitted to: they are held against the wheels ``before``. A truth is not
+    fitted: what it still contradicts ``after`` is a mistake.
+    """
+    from fgloc.calibrate import only_truth
     from fgloc.diagnosis.mistakes import find_mistakes
     from fgloc.recording.storage import find_beside
     from fgloc.types import Severity
@@ -246,7 +251,7 @@ def _bending(bags: Sequence[Path], map_file: Path | None, config: Config, fitted
         if map_file is not None or find_beside(bag, "map.yaml") is not None:
             continue
         with suppress(FglocError):  # a recording that calibrates the wheels alone, by its truth, need not be one to run
-            for finding in find_mistakes(bag, None, config).findings:
+            for finding in find_mistakes(bag, None, after if only_truth(bag, before) else before).findings:
                 keys = {key.removeprefix("expert.") for key in finding.lines}
                 if finding.severity is Severity.ERROR and not (keys and keys <= fitted):
                     texts.append(f"{bag}: {finding.text}" if len(bags) > 1 else finding.text)
@@ -282,7 +287,7 @@ def calibrate(
     rows = [(s.name, setting_unit(s.name), given_text(s), found_text(s)) for s in settings]
     say_table(("setting", "unit", "given", "found"), rows)
     say(f"configuration: {out}")
-    if wrong := _bending(bags, map_file, before, {s.name for s in settings}):
+    if wrong := _bending(bags, map_file, before, after, {s.name for s in settings}):
         for text in wrong:
             say_remark("error", text, err=True)
         say("not to be trusted: what is wrong there was fitted by the constants above; correct it first", err=True)

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 from refusal import refusal
+from typer.testing import CliRunner
 
-from fgloc import se2
+from fgloc import cli, se2
 from fgloc.calibrate import calibrate
-from fgloc.config import Config
+from fgloc.config import Config, load_config, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
 from fgloc_datasets.bag import BagWriter
@@ -79,6 +80,18 @@ def test_geometry_that_is_far_off_is_found_with_the_place_of_the_body(tmp_path):
     ends = [np.ptp(r.trajectory.poses[:, 0]) for r in (result, before)]
     true_extent = np.ptp(result.truth.poses[:, 0])
     assert abs(ends[0] - true_extent) < 0.3 * abs(ends[1] - true_extent)
+
+
+@pytest.mark.slow
+def test_a_radius_that_the_truth_corrects_is_no_mistake_any_more(tmp_path):
+    bag = write_tricycle(tmp_path, seconds=60.0)
+    short = settings({**GUESS, **TRUE, "radius": 0.092})
+    (tmp_path / "robot.yaml").write_text(yaml_of(short, tmp_path))
+    given = ["calibrate", str(bag), "--config", str(tmp_path / "robot.yaml"), "--out", str(tmp_path / "found.yaml")]
+    done = CliRunner().invoke(cli.app, given)
+    assert done.exit_code == 0, done.output
+    found = load_config(tmp_path / "found.yaml").wheels.drive.radius
+    assert found == pytest.approx(0.1, abs=0.001)
 
 
 def test_wheels_that_do_not_follow_the_truth_are_named(tmp_path):
