@@ -180,7 +180,8 @@ def lifecycle(kinds: Sequence[str], count: int) -> Iterator[Row]:
         memory = found["memory_mb"]
         crashes += len(found["crashes"]) + (found["code"] != 0)
         orphans += found["orphans"]
-        gained.append(max(memory[_SETTLED:], default=0.0) - memory[min(_SETTLED, len(memory)) - 1] if memory else 0.0)
+        settled = memory[min(_SETTLED, len(memory)) - 1] if memory else 0.0
+        gained.append(max(memory[_SETTLED:], default=settled) - settled)
         print(f"{kind}: { {k: v for k, v in found.items() if k != 'log'} }", file=sys.stderr)
     yield Row("ros.lifecycle_crashes", crashes, n=count)
     yield Row("ros.lifecycle_orphans", orphans, n=count)
