@@ -363,10 +363,8 @@ class Recorder:
         twist = self._compensation.twist(step, step.stamp_ns)
         by_clock = np.asarray(np.outer(twist, twist) * self._clock_sigma_s**2)
         carried, around = tracking.kidnapped(self._sightings.contradicting, belief)
-        frame.added_cov, frame.carried_cov = (
-            by_clock,
-            carried * around,
-        )  # a mixture of two Gaussians, the second one wide
+        frame.added_cov = by_clock
+        frame.carried_cov = carried * around  # of a mixture of two Gaussians, the second one wide
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + tracking.lost_cov(belief)
         modes = mode_decisions(frame.k, step.stamp_ns, frame.mode, tracking.since_fix_s, self._dead_reckoning_after_s)

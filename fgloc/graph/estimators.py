@@ -232,7 +232,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def _add_prior(self, rows: Sequence[slice]) -> None:
-        """Tell the graph, if there is one, the prior of rows that were vacant."""
+        """Add the prior of landmarks in rows of the installation that were vacant."""
 
     @abstractmethod
     def _begin_at(self, newest: Keyframe) -> None:
@@ -388,7 +388,7 @@ class ExtendedKalmanFilter(Estimator):
         """Do nothing: a filter holds no earlier keyframes."""
 
     def _add_prior(self, rows: Sequence[slice]) -> None:
-        """Do nothing: the belief has it."""
+        """Do nothing: a filter's belief has the prior already."""
 
 
 # --- The two smoothers of GTSAM behind one interface ------------------------------------------------------------------

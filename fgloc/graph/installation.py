@@ -116,6 +116,7 @@ class Installation:
         self.landmarks: dict[int, tuple[int, int]] = {}
         self.stateless: dict[int, FloatArray] = {}
         self.most = 0
+        self._width = len(POINT)  # rows of each landmark of such a map: of a marker's, if it has one
         self._vacant: list[int] = []
         for i, name in enumerate(self.names):
             section, *rest = name.split(".")
@@ -155,8 +156,7 @@ class Installation:
         Returns:
             The rows.
         """
-        width = len(MARKER) if any(len(cov) > len(POINT) for cov in self.stateless.values()) else len(POINT)
-        slots = len(self.landmarks) + self.vacancies
+        slots, width = len(self.landmarks) + self.vacancies, self._width
         count, at = width * max(min(self.most - slots, _SLOTS), 0), self.constants
         self.names = (*self.names[:at], *_vacant_names(at, at + count, width), *self.names[at:])
         self.index = {name: i for i, name in enumerate(self.names)}
@@ -372,7 +372,7 @@ def installation_of(
     made.stateless = {
         i: _prior(place, given.get(i)) for i, place in places.items() if i in given or any(place.values())
     }
-    made.most = most
+    made.most, made._width = most, max(map(len, made.stateless.values()), default=0)
     whole = ground or config.estimator.kind == "isam2"  # what holds all poses is not made anew for a few landmarks
     while made.stateless and made.vacancies < (most if whole else min(most, _SLOTS)):
         made.grow()

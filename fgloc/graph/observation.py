@@ -78,7 +78,7 @@ class Stacked:
     whitening: FloatArray | None = None
 
     def with_noise(self, by_landmark: FloatArray | None) -> Stacked:
-        """The same with noise of the landmark's place, whose square root ``(m, d, s)`` this is; None: there is none."""
+        """Copy with noise of the landmarks' places, whose square root ``(m, d, s)`` is given; None: there is none."""
         if by_landmark is None:
             return self
         values, vectors = np.linalg.eigh(by_landmark @ np.swapaxes(by_landmark, 1, 2))

@@ -245,7 +245,7 @@ class _OfLandmark:
 
 
 class _InPlane(_OfLandmark):
-    """Likewise of those in the plane of the base, with a covariance of their own."""
+    """Properties that are alike for sightings in the plane of the base, whose noise is a covariance of their own."""
 
     __slots__ = ()
 

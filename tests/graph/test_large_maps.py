@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -80,6 +81,25 @@ def test_a_landmark_takes_vacant_rows_and_gives_them_up_with_its_prior():
     assert all(is_vacant(name) for name in made.names[rows])
     assert len(set(made.names)) == len(made.index) == n
     assert [made.names[i] for i in made.motion_rows] == [name for name in constants if "sightings" not in name]
+
+
+def test_markers_and_points_of_one_map_take_each_others_rows():
+    held = {i: Landmark(i, np.array([1.0 * i, 0.0, 0.0]), np.eye(3), 0.2 if i < 8 else 0.0) for i in range(20)}
+    made = installation_of(SETTINGS, LandmarkMap(held), True, most=MOST)
+    for i in range(8):
+        made.occupy(i)  # all markers; only points are left
+    made.grow()
+    for i in (9, 10, 11):
+        made.occupy(i)
+    for i in (9, 0):
+        made.vacate(i)
+    for i in (12, 0):
+        made.occupy(i)
+    taken = sorted((first, first + count) for first, count in made.landmarks.values())
+    assert all(end <= after for (_, end), (after, _) in pairwise(taken))
+    assert {count for i, (_, count) in made.landmarks.items() if i < 8} == {6}
+    assert len(set(made.names)) == len(made)
+    assert all(made.names[made.landmarks[i][0]] == f"map.{i}.x_m" for i in made.landmarks)
 
 
 @pytest.mark.parametrize("kind", ["fixed_lag", "ekf"])

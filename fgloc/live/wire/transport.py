@@ -115,7 +115,7 @@ Take = Callable[[int], Iterable[tuple[int, T]]]
 
 
 def in_order(queues: Sequence[tuple[int, Take[T]]], first: Iterable[tuple[int, T]] = ()) -> list[T]:
-    """What waits in several queues, in the order of writing; what has no time of writing (0) comes before the rest.
+    """Merge the messages that wait in several queues, in the order of writing; those without a time (0) come first.
 
     They are looked at again until nothing more has come: a queue's newest message would else overtake older ones of
     queues that were looked at before it.
