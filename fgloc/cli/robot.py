@@ -81,7 +81,10 @@ def init(
     given = "" if read is not None and read.resolve() == out.resolve() else f" --config {shown_path(out)}"
     next_step(f"fgloc info {shown_path(bag)}{given}", "check the recording with it")
     if not {"odometry", "joints", "command", "imu"} & found.roles.keys():
-        raise typer.Exit(1)  # no run is possible
+        raise ConfigError(
+            f"{bag}: no run is possible, as no topic measures how the robot moves: give one under recording.topics in "
+            f"{out}, or record odometry, joint states, commands or an IMU"
+        )
     if not {"image", "sightings"} & base_roles(found.roles):
         return  # nothing to survey, or to calibrate on
     landmarks = find_beside(bag, "map.yaml")
