@@ -86,7 +86,7 @@ from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field import distances
 from benchmarks.field_peers import hear
 from benchmarks.field_recordings import RECORDINGS, Recording, mecanum, tricycle
-from benchmarks.recordings import SEEDS, Recorded, Take, cache_folder, changed, load, scenario
+from benchmarks.recordings import SEEDS, Recorded, Take, cache_folder, changed, load, scenario, truth_of
 from benchmarks.replays import failure, kept, replayed
 from benchmarks.scores import errors
 from fgloc import se2
@@ -589,9 +589,19 @@ def recorded_scenario(drive: str, case: str) -> Scenario:
 @lru_cache(maxsize=2)
 def load_drive(drive: str, case: str, seed: int) -> Recorded:
     """One recording, made first if it is not there."""
-    made = recorded_scenario(drive, case)
+    return load_made(recorded_scenario(drive, case), seed, f"drives/{drive}_{case}")
+
+
+def load_made(made: Scenario, seed: int, name: str) -> Recorded:
+    """The recording of a scenario with corners in place of images, made first if it is not there.
+
+    Args:
+        made: the scenario.
+        seed: of all that is drawn.
+        name: begins that of its folder in the cache.
+    """
     key = sha256(describe(made, seed, True).encode()).hexdigest()[:12]
-    folder = cache_folder() / "drives" / f"{drive}_{case}_{seed}_{key}"
+    folder = cache_folder() / f"{name}_{seed}_{key}"
     if not is_recorded(made, seed, folder, True):
         record_drive(made, seed, folder)
     config = config_of(robot_settings(made) | {"motion": {"use": False}})
@@ -609,7 +619,7 @@ def load_drive(drive: str, case: str, seed: int) -> Recorded:
         slip_s=none,
         slipping=none.astype(bool),
         slip=np.empty((0, 3)),
-        truth=np.empty((0, 4)),
+        truth=truth_of(events, start_ns),
         duration_s=duration_s,
     )
 

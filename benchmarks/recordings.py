@@ -189,7 +189,7 @@ def load(take: Take) -> Recorded:
         slip_s=slip_s,
         slipping=slipping,
         slip=slip,
-        truth=_truth(events, start_ns),
+        truth=truth_of(events, start_ns),
         duration_s=duration_s,
         camera=camera,
         installed=installed,
@@ -236,12 +236,13 @@ def robot(number: int) -> Recorded:
         slip_s=none[:, 0],
         slipping=none[:, 0] > 0,
         slip=none,
-        truth=_truth(events, start_ns),
+        truth=truth_of(events, start_ns),
         duration_s=_ROBOTS_S,
     )
 
 
-def _truth(events: Iterable[Event], start_ns: int) -> FloatArray:
+def truth_of(events: Iterable[Event], start_ns: int) -> FloatArray:
+    """Poses of the truth ``(n, 4)``: seconds from the start, x, y, yaw."""
     poses = [
         ((e.stamp_ns - start_ns) * 1e-9, e.position[0], e.position[1], quaternion_yaw(e.orientation))
         for e in events

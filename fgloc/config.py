@@ -293,6 +293,11 @@ class MotionConfig(Section):
     use: bool = expert(True, description="false: the model is not used")
     scale: float = expert(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
     scale_sigma: float = expert(0.01, ge=0, le=0.5, description="sigma of scale")
+    turn_scale: float = expert(1.0, ge=0.01, le=100, description="this robot's turn over the model's")
+    yaw_per_m: float = expert(0.0, ge=-10, le=10, description="rad/m that it is drawn to the left more than the model")
+    adaptation_sigma: float = expert(
+        0.03, ge=0, le=0.5, description="sigma of those two (share, rad/m); 0: scale alone is estimated"
+    )
     correlation: Literal["joint", "independent"] = expert(
         "joint", description="joint: decorrelated from the wheels; independent: for comparison"
     )

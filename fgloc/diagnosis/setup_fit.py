@@ -655,7 +655,7 @@ class Problem:
 
 def _installation(config: Config, held: LandmarkMap, has_gyro: bool, free: Mapping[str, float]) -> Installation:
     """Camera and markers, without clocks and wheels, which `EXTRAS` holds."""
-    plain = installation_of(config, held, corners=True, has_gyro=has_gyro, most=10_000, has_model=False)
+    plain = installation_of(config, held, corners=True, has_gyro=has_gyro, most=10_000, gains=())
     sigmas = dict(zip(plain.names, plain.sigmas.tolist(), strict=True))
     camera = {f"camera.{name}": sigmas.get(f"camera.{name}", _EXACT) for name in CAMERA}
     markers = {n: s for n, s in sigmas.items() if n.startswith("map.")}

@@ -22,7 +22,7 @@ from fgloc.estimation.faults import Contradicted, FaultAttribution, FaultVerdict
 from fgloc.estimation.log import flag_notes, motion_decisions
 from fgloc.graph.estimators import Estimator
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.ground import planar_turn
+from fgloc.graph.ground import planar_turn, predict
 from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
 from fgloc.graph.noise import COVARIANCE_FACTOR, DOUBTED, FusionRules, NoiseBudget, with_yaw
@@ -38,6 +38,7 @@ from fgloc.types import Decision, FloatArray, MotionMeasurement, MotionReadings,
 _SKID = 0.05  # of a turn: by so much wheels are wrong in one turn and not in the next
 _USUAL_SPEED = 0.5  # m/s, before the robot has driven
 _CHANGES_S = 600.0  # after such a time what the wheels are off by may be something else
+_MODEL_CLOCK_S = 0.02  # how much sooner or later than its model a robot obeys: by load, floor, other robots of its kind
 _MEMORIES = 2.0  # times what a yaw remembers of the gyro: two yaws so far apart measure the turn without it
 
 
@@ -146,6 +147,12 @@ class MotionSources:
         return readings.wheels is not None and others and not {"wheels", "learned"} & set(rejected)
 
     @property
+    def clock_sigma_s(self) -> float:
+        """Sigma of the clock by which the robot is seen to move [s]: that of a model of commands is its own delay."""
+        by_model = self._wheels.from_commands and self._learned is not None and self._turn is None
+        return _MODEL_CLOCK_S if by_model else 0.0
+
+    @property
     def learned_is_independent(self) -> bool:
         """Whether the learned motion can be held against the wheels: it does not read them."""
         return self._learned is not None and not self._learned.model.card.reads("wheels")
@@ -235,11 +242,12 @@ class MotionSources:
     def _measure_learned(self, step: Step) -> MotionMeasurement | None:
         if self._learned is None:
             return None
-        m = self._learned.measure_scaled(step, 0.0 if self.gyro is None else self.gyro.bias)
-        if m is None:
+        measured = self._learned.measure_adapted(step, 0.0 if self.gyro is None else self.gyro.bias)
+        if measured is None:
             return None
+        m, by = measured
         by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []
-        return self._installed(m, self._learned.derivatives(m.motion), *by_turn)
+        return self._installed(m, by, *by_turn)
 
     def unknown(
         self, step: Step, readings: MotionReadings | None = None, carried_s: float | None = None
@@ -387,6 +395,7 @@ _MOVED = 0.25  # of the reference source's travel: a wheel that turned less stoo
 _LEAST_M = 0.15
 KNOWN = "distrusted"  # a failure that the configuration states
 CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
+_STANDS = 0.01  # m/s or rad/s: slower, a robot stands
 _PROVEN_M = 0.5  # way over which wheels and model have agreed before the model may accuse the wheels
 
 
@@ -587,6 +596,73 @@ def _without(readings: MotionReadings, sources: Collection[str]) -> MotionReadin
     return replace(readings, **gone, beside=beside)
 
 
+# --- Drift that no other source shows ---
+
+_STRETCH_S = 2.0  # between two fixes that are compared: about as long as errors of slips and of models last
+_CALM_S = 30.0  # of driving without any excess that are counted before the run
+_MOST = 0.5  # of the way and of the turn, by which dead reckoning may be off; more is a wrong place
+
+
+class UnseenDrift:
+    """What dead reckoning was off by between fixes, beyond its covariance, where no source shows errors of another.
+
+    Wheels alone do not show that they slip, and a model of commands not that it is of another floor. Sightings do: over
+    stretches of `_STRETCH_S` from one fix to another the squared error of dead reckoning, less what its covariance
+    expects, is summed over the run. It is to be expected to go on: as noise of that density.
+    """
+
+    def __init__(self, estimator: Estimator) -> None:
+        """Set up for the estimator, whose installation it knows."""
+        self._estimator = estimator
+        self._belief: PoseWithCovariance | None = None  # by motion alone, since the fix where the stretch began
+        self._stretch_s = self._moving_s = self._unseen_s = 0.0
+        self._way = self._turn = 0.0
+        self._excess, self._doubt = np.zeros(2), np.zeros(2)  # m², rad²: sums, and what their variances are by chance
+        self._driven_s = _CALM_S
+
+    def forget_fix(self) -> None:
+        """The pose is set anew, or no motion is known to have led there."""
+        self._belief = None
+
+    def cov(self, step: Step) -> FloatArray | None:
+        """Covariance ``(3, 3)`` to be added to the motion of a step; None: dead reckoning is as good as it says."""
+        sure = np.maximum(self._excess - np.sqrt(self._doubt), 0.0)  # m², rad²
+        if not sure.any():
+            return None
+        along, turn = sure / self._driven_s
+        return np.diag([0.5 * along, 0.5 * along, turn]) * step.dt
+
+    def advance(self, step: Step, motions: Sequence[MotionMeasurement]) -> None:
+        """Go on by the motions of a step, before sightings are held against them."""
+        self._unseen_s += step.dt
+        if self._belief is None or self._unseen_s > _STRETCH_S or not motions:
+            self._belief = None
+            return
+        before = self._belief
+        self._belief = predict(before, self._estimator.installed, self._estimator.installation, motions)
+        x, y, yaw = se2.between(before.pose, self._belief.pose)
+        self._way, self._turn = self._way + math.hypot(x, y), self._turn + abs(yaw)
+        self._stretch_s += step.dt
+        self._moving_s += step.dt * (math.hypot(x, y) + abs(yaw) > _STANDS * step.dt)
+
+    def fix(self, belief: PoseWithCovariance) -> None:
+        """Compare with a fix at the end of the step, and begin the next stretch there."""
+        if self._belief is not None and self._stretch_s < _STRETCH_S:
+            self._unseen_s = 0.0
+            return
+        if self._belief is not None and self._moving_s > 0.0:
+            x, y, yaw = se2.between(self._belief.pose, belief.pose)
+            most = _MOST * np.array([self._way, self._turn]) + (_LEAST_M, _LEAST_M)
+            error = np.minimum([math.hypot(x, y), abs(yaw)], most) ** 2
+            P = self._belief.cov + belief.cov
+            expected = np.array([P[0, 0] + P[1, 1], P[2, 2]])
+            self._excess += error - expected
+            self._doubt += 2.0 * expected**2
+            self._driven_s += self._moving_s
+        self._belief, self._unseen_s = belief, 0.0
+        self._stretch_s = self._moving_s = self._way = self._turn = 0.0
+
+
 # --- Judge, and revise past steps -------------------------------------------------------------------------------------
 
 _RATE_MEMORY_S = 60.0  # added to the time of a run, which at its beginning says little of a rate
@@ -640,23 +716,29 @@ class MotionJudge:
         if sensors.beside:
             self.sources.beside = OdometriesBeside(config.weights, sensors.beside, estimator.factors, by_sightings)
         self._lift = LiftMonitor(config.estimator.lag_s, None if sensors.gyro is None else sensors.gyro.up)
+        self._unseen = UnseenDrift(estimator) if config.weights.adaptive and not estimator.installation.ground else None
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
     def begin_segment(self, step: Step) -> None:
         """Begin a segment, after a jump of the clock or with the first step."""
-        self.sources.begin_segment()
+        self._forget_fix()
         self._faults.begin(step)
         self._lift.reset()
 
     def begin_replay(self) -> None:
         """Prepare for earlier steps of the segment, which were collected until the first pose was known."""
-        self.sources.begin_segment()
+        self._forget_fix()
         self._lift.reset()
 
     def restart(self) -> None:
         """Forget motion and faults, as the pose was set anew and no motion led there."""
-        self.sources.begin_segment()
+        self._forget_fix()
         self._faults.reset()
+
+    def _forget_fix(self) -> None:
+        self.sources.begin_segment()
+        if self._unseen is not None:
+            self._unseen.forget_fix()
 
     def read(self, step: Step, since_fix_s: float) -> MotionReadings:
         """Read every source once; one without data yields nothing.
@@ -686,6 +768,13 @@ class MotionJudge:
             verdict, left_out = self._judge_beside(step, readings, verdict)
             revisions = (*revisions, *left_out)
         factors = tuple(self.combine(step, readings, verdict.budget))
+        if self._unseen is not None:
+            unwitnessed = source_difference(readings, self.sources) is None and not self._lift.carried
+            drift = self._unseen.cov(step) if unwitnessed else None
+            self._unseen.advance(step, factors if unwitnessed else ())
+            if drift is not None:
+                verdict = replace(verdict, budget=replace(verdict.budget, drift_cov=drift))
+                factors = tuple(self.combine(step, readings, verdict.budget))
         if self._lift.carried:
             return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)
         if factors[0].source == "unknown":
@@ -720,6 +809,8 @@ class MotionJudge:
         """Update bias and drift of the sources after a step, see `MotionSources.commit`."""
         if fix is not None:
             self.record_fix()
+            if self._unseen is not None:
+                self._unseen.fix(fix)
         self.sources.commit(motion.readings, fix, observes_yaw)
 
     def record_fix(self) -> None:

@@ -33,6 +33,7 @@ from fgloc.graph.installation import GROUND, VACANT_SIGMA, Installation, Install
 from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov, split
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
+from fgloc.sensors.learned.sensor import gains_of
 from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.types import (
     FloatArray,
@@ -844,7 +845,7 @@ def make_estimator(
         landmark_map,
         poses.landmarks.sees_corners,
         has_gyro=motion.gyro is not None,
-        has_model=motion.learned is not None,
+        gains=() if motion.learned is None else gains_of(motion.learned.model.card),
         sensed=[parameter for sensor in poses.registered for parameter in getattr(sensor, "parameters", ())],
         cameras=poses.landmarks.camera_names or ("",),
     )

@@ -84,6 +84,7 @@ class Installation:
             newest pose; in the graph each keyframe has its own.
         effects: what a constant changes; constants of one effect may be taken for one another.
         length: constants that change the length of motions, and no turn, if all change alike.
+        gates: sigmas of the gates of those that may change by more than their prior says.
         constants: how many rows are the same for all poses: all, or all but those.
     """
 
@@ -93,6 +94,7 @@ class Installation:
         landmark_cov: Mapping[int, FloatArray] | None = None,
         effects: Mapping[str, Sequence[str]] | None = None,
         length: Sequence[str] = (),
+        gates: Mapping[str, float] | None = None,
     ) -> None:
         """Set prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
 
@@ -103,6 +105,7 @@ class Installation:
                 (z, the rotation) keeps its sigma, what is no state is passed over.
             effects: as the attribute; default: none is known.
             length: likewise.
+            gates: likewise.
         """
         blocks = {_block(name) for name, s in parameters.items() if s > 0.0} - {""}
         blocks |= {f"map.{i}" for i in landmark_cov or {}}
@@ -110,6 +113,7 @@ class Installation:
         self.names = tuple(kept)
         self.effects = {name: tuple(effects[name]) for name in kept if effects and name in effects}
         self.length = tuple(name for name in length if kept.get(name))
+        self.gates = {name: sigma for name, sigma in (gates or {}).items() if kept.get(name)}
         sigmas = np.array(list(kept.values()))
         self.index = {name: i for i, name in enumerate(self.names)}
         self.blocks: dict[str, tuple[int, int]] = {}
@@ -221,7 +225,7 @@ class Installation:
             for i, cov in chosen.items()
             for name, v in zip(MARKER, np.diag(cov).tolist(), strict=False)
         }
-        other = Installation(own | places | ground, chosen, self.effects, self.length)
+        other = Installation(own | places | ground, chosen, self.effects, self.length, self.gates)
         rows = [other.index[self.names[i]] for i in kept]
         other._prior_cov[np.ix_(rows, rows)] = self._prior_cov[np.ix_(kept, kept)]
         other._prior_mean[rows] = self._prior_mean[kept]
@@ -242,7 +246,7 @@ class Installation:
         rows = self._gated
         off = np.abs(belief.mean[rows] - self._prior_mean[rows])
         prior, found = np.diag(self._prior_cov)[rows], np.diag(belief.cov)[rows]
-        spread = np.sqrt(np.maximum(prior - found, _UNSEEN * prior))
+        spread = np.maximum(np.sqrt(np.maximum(prior - found, _UNSEEN * prior)), self._least_spread)
         beyond = (off > PRIOR_GATE * spread) & (off > SURE_SIGMAS * np.sqrt(np.maximum(found, 0.0)))
         order = np.argsort(-off / spread, kind="stable")
         return tuple(self.names[rows[i]] for i in order if beyond[i])
@@ -258,6 +262,11 @@ class Installation:
         own = [i for i, name in enumerate(self.names[: self.constants]) if not name.startswith("map.")]
         return np.array([i for i in own if self.sigmas[i] > _HELD], dtype=np.int64)
 
+    @cached_property
+    def _least_spread(self) -> FloatArray:
+        """Least sigma ``(n,)`` of the gates of those rows."""
+        return np.array([self.gates.get(self.names[i], 0.0) for i in self._gated])
+
     def with_sigmas(self, held: Iterable[str], freed: Mapping[str, float]) -> Installation:
         """Copy with some parameters held as exact at their given values, some free together in one direction.
 
@@ -266,7 +275,8 @@ class Installation:
             freed: prior sigmas of those that are free; of several they change in this proportion.
         """
         other = copy.copy(self)
-        other.__dict__.pop("_gated", None)
+        for cached in ("_gated", "_least_spread"):
+            other.__dict__.pop(cached, None)
         other.sigmas, other._prior_cov = self.sigmas.copy(), self._prior_cov.copy()
         for name, sigma in {**dict.fromkeys(held, _HELD), **freed}.items():
             i = self.index[name]
@@ -319,7 +329,7 @@ def installation_of(
     corners: bool,
     has_gyro: bool = False,
     most: int = MOST_LANDMARKS,
-    has_model: bool = True,
+    gains: Sequence[str] = ("scale",),
     sensed: Sequence[Parameter] = (),
     cameras: Sequence[str] = ("",),
 ) -> Installation:
@@ -334,22 +344,22 @@ def installation_of(
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
         most: landmarks of a map that are states at a time; of a larger map those that are seen (`Installation.occupy`).
-        has_model: whether there is a learned motion.
+        gains: of the learned motion that may differ; none: there is no such motion.
         sensed: parameters of registered sensors.
         cameras: names of the cameras that see corners.
     """
     rb = config.landmarks
-    there = {"wheels": True, "gyro": has_gyro, "learned": has_model}
-    roles = [role for role, is_there in there.items() if is_there]
+    roles = ["wheels", *(["gyro"] if has_gyro else []), *(f"learned.{gain}" for gain in gains)]
     parameters = (*registry.motion_parameters(config, roles), *sensed)
     sigmas = {parameter.name: parameter.sigma for parameter in parameters}
     effects: dict[str, tuple[str, ...]] = dict(_EFFECTS)
     effects |= {f"{camera_block(c)}.{name}": e for c in cameras for name, e in _EFFECTS_OF_CAMERA.items()}
     effects |= {parameter.name: parameter.effects for parameter in parameters}
     length = [parameter.name for parameter in parameters if parameter.lengthens]
+    gates = {parameter.name: parameter.gate_sigma for parameter in parameters if parameter.gate_sigma > 0.0}
     ground = dict(zip(GROUND, _GROUND_SIGMAS, strict=True)) if config.estimator.ground == "uneven" else {}
     if landmark_map is None:
-        return Installation(sigmas | ground, None, effects, length)
+        return Installation(sigmas | ground, None, effects, length, gates)
     if corners:
         for name in cameras:
             camera = config.of_camera(name).camera
@@ -367,8 +377,8 @@ def installation_of(
     given = {i: landmark.cov for i, landmark in by_id.items() if landmark.cov is not None}
     if len(by_id) <= most:
         sigmas |= {f"map.{i}.{name}": v for i, place in places.items() for name, v in place.items()}
-        return Installation(sigmas | ground, given, effects, length)
-    made = Installation(sigmas | ground, None, effects, length)
+        return Installation(sigmas | ground, given, effects, length, gates)
+    made = Installation(sigmas | ground, None, effects, length, gates)
     made.stateless = {
         i: _prior(place, given.get(i)) for i, place in places.items() if i in given or any(place.values())
     }

@@ -151,11 +151,14 @@ class NoiseBudget:
         rejected: sources that are left out, and why.
         scale: on the covariance of the wheels, as they and the other sources differ. The learned motion's follows.
         overruled_cov: ``(3, 3)`` added to each factor, as sightings found the motion wrong; None: they did not.
+        drift_cov: ``(3, 3)`` added to each factor, as dead reckoning was further off between fixes than its covariance
+            says; None: it was not.
     """
 
     rejected: Mapping[str, str] = field(default_factory=dict)
     scale: float = 1.0
     overruled_cov: FloatArray | None = None
+    drift_cov: FloatArray | None = None
 
     @property
     def scales(self) -> dict[str, float]:
@@ -205,6 +208,8 @@ class NoiseBudget:
             known.append(replace(gyro, motion=with_yaw(known[0].motion, float(gyro.motion[2]))))
         if readings.inertial is not None:
             known = [replace(m, inertial=readings.inertial) for m in known]
+        if self.drift_cov is not None:
+            known = [replace(m, cov=m.cov + self.drift_cov) for m in known]
         return [self.overruled(m) for m in known]
 
     def overruled(self, m: MotionMeasurement) -> MotionMeasurement:

@@ -314,6 +314,7 @@ class Parameter(NamedTuple):
         effects: what it changes: "length" (distances), "turn", "heading" (where landmarks are seen while the robot
             turns). Parameters of one effect may be taken for one another.
         lengthens: whether it is one of those that, changed alike, make motions longer and leave turns as they are.
+        gate_sigma: by so much it may change between runs; its gate is of this sigma, where the prior's is less.
     """
 
     name: str
@@ -321,6 +322,7 @@ class Parameter(NamedTuple):
     rank: Rank = Rank.GAIN
     effects: tuple[str, ...] = ()
     lengthens: bool = False
+    gate_sigma: float = 0.0
 
 
 class FoundRow(NamedTuple):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import rotation_of
 from fgloc.sensors import registry
@@ -20,7 +21,7 @@ from fgloc.sensors.learned.network import JointCalibration
 from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc.sensors.measurements import LandmarkMeasurement, LandmarkSighting
 from fgloc.sensors.odometry import BesideOdometry
-from fgloc.sensors.wheels.motion import WheelMotion
+from fgloc.sensors.wheels.motion import HALF_NS, WheelMotion
 from fgloc.types import (
     Camera,
     FloatArray,
@@ -156,12 +157,16 @@ def _tilt(rates: FloatArray, seconds: float) -> FloatArray:
 
 
 class MotionCompensation:
-    """Moves sightings from their exposure to the keyframe, by the wheels and, where it is measured, the gyro's turn."""
+    """Moves sightings from their exposure to the keyframe, by the wheels and, where it is measured, the gyro's turn.
+
+    Where commands stand in for wheels, a model of the same commands takes their place: a robot follows them late.
+    """
 
     def __init__(self, poses: PoseSensors, motion: MotionSensors, jitter_s: float) -> None:
         """Take the sensors, and the sigma ``jitter_s`` [s] of the stamp of each single image."""
         self._landmarks, self._jitter_s = poses.landmarks, jitter_s
         self._wheels, self._gyro, self._attitude = motion.wheels, motion.gyro, motion.attitude
+        self._learned = motion.learned
         self._sensor_of = {stream.event: sensor for sensor in poses.registered for stream in sensor.streams}
 
     def measure(self, step: Step, late_s: float | Callable[[str], float]) -> list[LandmarkMeasurement]:
@@ -202,9 +207,15 @@ class MotionCompensation:
 
     def _motion_to(self, step: Step, at_ns: int) -> tuple[FloatArray, FloatArray]:
         """Motion ``T_keyframe_then`` ``(3,)`` to another time, with its covariance ``(3, 3)``."""
-        motion, cov = self._wheels.motion_between(step, step.stamp_ns, at_ns)
+        motion, cov = self._moved(step, step.stamp_ns, at_ns)
         turned = None if self._gyro is None else self._turned(self._gyro, step, at_ns)
         return (motion if turned is None else np.array([*motion[:2], turned])), cov
+
+    def _moved(self, step: Step, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Motion ``(3,)`` between two times, with its covariance ``(3, 3)``, by the model of commands or the wheels."""
+        learned = self._learned if self._wheels.from_commands else None
+        by_model = None if learned is None else learned.motion_between(step, start_ns, end_ns)
+        return self._wheels.motion_between(step, start_ns, end_ns) if by_model is None else by_model
 
     def _turned(self, gyro: Gyro, step: Step, at_ns: int) -> float | None:
         """Yaw of ``T_keyframe_then`` [rad] by the gyro; None: it was silent for some of that time."""
@@ -222,7 +233,8 @@ class MotionCompensation:
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Twist ``(3,)`` of the base [m/s, m/s, rad/s] at a time near the step's end."""
-        twist = self._wheels.twist(step, at_ns)
+        motion, _ = self._moved(step, at_ns - HALF_NS, at_ns + HALF_NS)
+        twist = np.asarray(se2.log(motion) / (2e-9 * HALF_NS))
         if self._gyro is not None and step.inertial:
             twist[2] = self._gyro.rates_at(step.inertial, (at_ns,))[0]
         return twist

@@ -183,35 +183,48 @@ def _check(tensors: Tensors, card: ModelCard, path: Path) -> None:
             raise ModelError(f"{path}: {name} holds NaN or infinite weights, expected finite ones; {_REMEDY}")
 
 
+GAINS = ("scale", "turn_scale", "yaw_per_m")
+"""What this robot does otherwise than the one that the model is of: settings, and parameters of the installation."""
+_GATE_SIGMA = 0.05  # share, rad/m: floor, load and battery change a robot by more than its prior, not by six of it
+
+
+def gains_of(card: ModelCard) -> tuple[str, ...]:
+    """Gains in which a robot may differ from this model: turns are the gyro's or the wheels', if it reads those."""
+    return GAINS[:1] if card.reads("wheels") or card.reads("gyro") else GAINS
+
+
 def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ...]:
-    """Parameter of the learned motion with its prior."""
-    return (
+    """Gains of the learned motion with their priors, those that ``sources`` names as ``learned.GAIN``."""
+    motion = config.motion
+    sigmas = {gain: motion.scale_sigma if gain == "scale" else motion.adaptation_sigma for gain in GAINS}
+    return tuple(
         Parameter(
-            "learned.scale",
-            config.motion.scale_sigma if "learned" in sources else 0.0,
+            f"learned.{gain}",
+            sigma if f"learned.{gain}" in sources else 0.0,
             Rank.MODEL,
-            ("length",),
-            lengthens=True,
-        ),
+            ("length",) if gain == "scale" else ("turn",),
+            lengthens=gain == "scale",
+            gate_sigma=_GATE_SIGMA if motion.adaptation_sigma > 0.0 else 0.0,
+        )
+        for gain, sigma in sigmas.items()
     )
 
 
 def _found_rows(config: Config) -> tuple[FoundRow, ...]:
-    """Row of ``metrics.json`` on the learned motion."""
-    return (FoundRow("learned.scale", "learned.scale", 1.0, 1.0),)
+    """Rows of ``metrics.json`` on the learned motion."""
+    return tuple(
+        FoundRow(f"learned.{gain}", f"learned.{gain}", 1.0 if gain == "scale" else getattr(config.motion, gain), 1.0)
+        for gain in GAINS
+    )
 
 
 def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
-    """Setting of the learned motion's scale, as a run has estimated it."""
-    scale = config.motion.scale
-    now = scale * (1.0 + state.value("learned.scale"))
-    yield from state.setting("motion.scale", scale, now, {"learned.scale": scale})
-
-
-def _derivatives(motion: FloatArray) -> dict[str, FloatArray]:
-    """Derivative ``(3,)`` of a motion (right perturbation) by each parameter."""
-    rho_x, rho_y, _ = se2.log(motion)
-    return {"learned.scale": np.array([rho_x, rho_y, 0.0])}
+    """Gains of the learned motion, as a run has estimated them."""
+    for gain in GAINS:
+        given = getattr(config.motion, gain)
+        factor = given if gain.endswith("scale") else 1.0
+        now = given + factor * state.value(f"learned.{gain}")
+        yield from state.setting(f"motion.{gain}", given, now, {f"learned.{gain}": factor})
 
 
 INSTALLATION = MotionInstallation(_parameters, _found_rows, _settings, {"motion.scale": "motion.scale_sigma"})
@@ -240,8 +253,10 @@ class LearnedMotion:
         self.model = model
         self.rejections: Counter[str] = Counter()
         self._use = config.use
-        self._scale = config.scale
         self._reader = SignalReader(model.card, imu_up)
+        self._gains = {f"learned.{gain}": getattr(config, gain) - (gain.endswith("scale")) for gain in GAINS}
+        # A velocity model carries its velocity from step to step; measured signals are known for the step alone
+        self._at_any_time = model.card.family == "displacement" and model.card.inputs == ("commands",)
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
 
@@ -296,16 +311,42 @@ class LearnedMotion:
         self._reached = (step.segment, step.stamp_ns)
         return MotionMeasurement("learned", step.start_ns, step.stamp_ns, prediction.motion, prediction.cov)
 
-    def measure_scaled(self, step: Step, gyro_bias: float = 0.0) -> MotionMeasurement | None:
-        """Predict the step for this robot, see `measure`: distances are ``motion.scale`` times the model's."""
-        m, scale = self.measure(step, gyro_bias), self._scale
-        if m is None or scale == 1.0:
-            return m
-        return replace(m, motion=se2.exp(se2.log(m.motion) * (scale, scale, 1.0)))
+    def measure_adapted(
+        self, step: Step, gyro_bias: float = 0.0
+    ) -> tuple[MotionMeasurement, dict[str, FloatArray]] | None:
+        """Predict the step for this robot, see `measure`: with its gains as they are configured.
 
-    def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
-        """Derivatives ``(3,)`` of a motion of this source by its parameters."""
-        return _derivatives(motion)
+        Returns:
+            The motion, and its derivatives ``(3,)`` by the gains.
+        """
+        m = self.measure(step, gyro_bias)
+        if m is None:
+            return None
+        moved = se2.log(m.motion)
+        rho_x, rho_y, turn = moved
+        by = {
+            "learned.scale": np.array([rho_x, rho_y, 0.0]),
+            "learned.turn_scale": np.array([0.0, 0.0, turn]),
+            "learned.yaw_per_m": np.array([0.0, 0.0, rho_x]),
+        }
+        if any(self._gains.values()):
+            moved = moved + sum(gain * by[name] for name, gain in self._gains.items())
+            m = replace(m, motion=se2.exp(moved))
+        return m, by
+
+    def motion_between(self, step: Step, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray] | None:
+        """Motion ``(3,)`` and covariance ``(3, 3)`` from one time to another near the step's end, which may be earlier.
+
+        Returns:
+            None if the model reads more than commands, is not used or cannot predict.
+        """
+        if not (self._use and self._at_any_time) or start_ns == end_ns or self._unusable(step):
+            return None
+        found = self.model.predict(step.controls, min(start_ns, end_ns), max(start_ns, end_ns), None)
+        if found is None or start_ns < end_ns:
+            return None if found is None else (found.motion, found.cov)
+        ad = se2.adjoint(found.motion)
+        return se2.inverse(found.motion), np.asarray(ad @ found.cov @ ad.T)
 
     def _unusable(self, step: Step) -> str:
         for command in reversed(step.controls):

@@ -203,7 +203,7 @@ _TRACKS: dict[str, type[Track]] = {
     "command": CommandTrack,
 }
 
-_HALF_NS = 20_000_000
+HALF_NS = 20_000_000
 _SHORTEST_TOLD_S = 1e-3  # without a known motion, in all; less is counted, but no note
 
 
@@ -339,8 +339,8 @@ class WheelMotion:
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Twist ``(3,)`` of the base [m/s, m/s, rad/s] at a time near the step's end: the mean over 40 ms around it."""
-        motion, _ = self.motion_between(step, at_ns - _HALF_NS, at_ns + _HALF_NS)
-        return np.asarray(se2.log(motion) / (2e-9 * _HALF_NS))
+        motion, _ = self.motion_between(step, at_ns - HALF_NS, at_ns + HALF_NS)
+        return np.asarray(se2.log(motion) / (2e-9 * HALF_NS))
 
     def derivatives(
         self,

@@ -1,0 +1,302 @@
+"""Worth of the learned motion, and of its adaptation: ``python -m benchmarks.learning [--quick] [--jobs N] [--json FILE]``.
+
+A model of commands is trained here, on perfect recordings of the simulated robot on its grippy floor (``base``), and one
+for each change (``native``): ``floor`` (friction 0.2 in place of 0.8), ``load`` (3 kg at the rear left), ``wheel`` (the
+right one 4 % smaller) and ``both`` (the load on a floor of friction 0.3). Then other robots with the change, as
+installed, drive by control functions that no training has seen: corners without rendering at 5 Hz, which are there for
+120 s, then dark for 30 s and there for 30 s in turn, to 300 s. Online, one model in four ways: ``adapted`` (the default),
+``frozen`` (`motion.adaptation_sigma` and `.scale_sigma` 0), ``native``, and ``none``.
+
+- ``floor.CHANGE.WAY.drift30_percent``: of a robot that has commands alone; end errors of the dark stretches over the way
+  in them, all seeds together; the spread is that of the seeds.
+- ``floor.CHANGE.drift30_over_native``: of ``adapted``; ``.frozen_over_native`` beside it.
+- ``floor.CHANGE.nees_over_3``: of ``adapted``, whole runs.
+- ``never_worse``: share of all those runs (seeds, changes) in which the mean error of ``adapted`` is more than 5 % worse than
+  that of ``frozen`` or of ``none``.
+- ``worth.SENSORS.CHANGE.WAY.ate_mm``: the same runs with wheels (``wheels``), with wheels and gyro (``gyro``): mean error.
+- ``wheels_only.dark60.MODE.{ate_mm,nees_over_3}``: robots of `benchmarks.installed` on slippery patches, a minute dark,
+  whose gyro and model are taken away.
+- ``step_over_frozen``: time of a step with adaptation over that without, of the runs of ``floor``; the spread is over them.
+
+The form of the gains was chosen on free rollouts of test seeds 131 to 135 of the changes floor, wheel and both, none of
+which is reported here.
+"""
+
+# ruff: noqa: E501 (lines of the description)
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.common import Row, main
+from benchmarks.drives import load_made
+from benchmarks.recordings import SEEDS, Recorded, Split, Take, cache_folder, changed, load, scenario
+from benchmarks.replays import failure, failures, kept, parallel, replayed
+from benchmarks.scores import errors
+from fgloc import se2
+from fgloc.errors import FglocError
+from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.learned.card import Split as Parts
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Event, FloatArray
+from fgloc_datasets.sim.record import BUNDLED, Job, describe, load_suite, record_suite
+from fgloc_datasets.sim.scenario import Installation, Payload, Scenario
+from fgloc_training.config import DataConfig, NetworkConfig, OptimizationConfig, TrainConfig
+from fgloc_training.data import load_run
+from fgloc_training.train import train
+
+CHANGES = ("floor", "load", "wheel", "both")
+WAYS: dict[str, dict[str, Any]] = {
+    "adapted": {},
+    "frozen": {"adaptation_sigma": 0.0, "scale_sigma": 0.0},
+    "native": {},
+    "none": {"use": False},
+}
+SENSORS: dict[str, tuple[type[Event], ...]] = {  # what a robot with these lacks
+    "commands": (OdometryEvent, JointsEvent, ImuEvent),
+    "wheels": (ImuEvent,),
+    "gyro": (),
+}
+TEST_SEEDS: dict[Split, tuple[int, ...]] = {"test": tuple(range(171, 181)), "validation": tuple(range(161, 166))}
+_WORTH_SEEDS = 4
+_TRAIN_SEEDS = {"train": (11, 12, 13), "validation": (21, 22)}
+_DURATION_S, _FIXES_S, _DARK_S = 300.0, 120.0, 30.0
+_WORSE = 1.05
+_DATA = DataConfig(smoothing_s=0.1)  # the truth is exact
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Cell:
+    """One run: of a change, with these sensors, in one way."""
+
+    change: str
+    seed: int
+    sensors: str
+    way: str
+
+    @property
+    def name(self) -> str:
+        """Name of the cell in the cache."""
+        return f"learning_{self.change}_{self.sensors}_{self.way}_{self.seed}"
+
+
+def measure(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
+    """Yield every row; a quick run has one seed and one change."""
+    seeds, changes = (TEST_SEEDS[split][:1], CHANGES[:1]) if quick else (TEST_SEEDS[split], CHANGES)
+    for change in ("base", *changes):
+        model(change)
+    cells = [Cell(c, s, "commands", way) for c in changes for s in seeds for way in WAYS]
+    rest = [w for w in WAYS if w != "native"]
+    cells += [Cell(c, s, k, w) for c in changes for s in seeds[:_WORTH_SEEDS] for k in ("wheels", "gyro") for w in rest]
+    groups = [
+        [cell for cell in cells if (cell.change, cell.seed) == key]
+        for key in sorted({(c.change, c.seed) for c in cells})
+    ]
+    found: dict[Cell, dict[str, Any]] = {}
+    for done in parallel(_run_group, groups, jobs):
+        found.update(done)
+    yield from _floor(found, changes, seeds)
+    yield from _worth(found, changes, seeds[:_WORTH_SEEDS])
+    ratios = [
+        found[Cell(c, s, "commands", "adapted")]["step_ms"] / found[Cell(c, s, "commands", "frozen")]["step_ms"]
+        for c in changes
+        for s in seeds
+    ]
+    yield _row("step_over_frozen", ratios)
+    yield from _wheels_only(quick, split, jobs)
+
+
+def _row(name: str, values: Sequence[float], unit: str = "") -> Row:
+    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+
+
+def _floor(found: dict[Cell, dict[str, Any]], changes: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
+    worse = 0
+    for change in changes:
+        drifts = {}
+        for way in WAYS:
+            ends = np.array([found[Cell(change, s, "commands", way)]["ends"] for s in seeds])
+            per_seed = 100.0 * ends[:, 0] / ends[:, 1]
+            drifts[way] = 100.0 * float(ends[:, 0].sum() / ends[:, 1].sum())
+            name = f"floor.{change}.{way}.drift30_percent"
+            yield Row(name, drifts[way], float(np.std(per_seed)), len(seeds), "%")
+        yield Row(f"floor.{change}.drift30_over_native", drifts["adapted"] / drifts["native"], n=len(seeds))
+        yield Row(f"floor.{change}.frozen_over_native", drifts["frozen"] / drifts["native"], n=len(seeds))
+        nees = [found[Cell(change, s, "commands", "adapted")]["nees_over_3"] for s in seeds]
+        yield _row(f"floor.{change}.nees_over_3", nees)
+        for s in seeds:
+            ate = {way: found[Cell(change, s, "commands", way)]["ate_mm"] for way in WAYS}
+            worse += ate["adapted"] > _WORSE * min(ate["frozen"], ate["none"])
+    yield Row("never_worse", worse / (len(changes) * len(seeds)), n=len(changes) * len(seeds))
+
+
+def _worth(found: dict[Cell, dict[str, Any]], changes: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
+    for sensors in SENSORS:
+        for change in changes:
+            for way in (w for w in WAYS if w != "native"):
+                ate = [found[Cell(change, s, sensors, way)]["ate_mm"] for s in seeds]
+                yield _row(f"worth.{sensors}.{change}.{way}.ate_mm", ate, "mm")
+
+
+# --- One run ----------------------------------------------------------------------------------------------------------
+
+
+def _run_group(cells: Sequence[Cell]) -> dict[Cell, dict[str, Any]]:
+    return {
+        cell: dict(kept(f"{cell.name}_{_made(cell.change, True)[1]}", lambda cell=cell: run_cell(cell)))
+        for cell in cells
+    }  # type: ignore[misc]
+
+
+def run_cell(cell: Cell) -> dict[str, Any]:
+    """Errors of one run online."""
+    recorded = load_made(_made(cell.change, True)[0], cell.seed, f"learning/{cell.change}")
+    recorded = replace(recorded, events=tuple(e for e in recorded.events if not isinstance(e, SENSORS[cell.sensors])))
+    settings: dict[str, Any] = {
+        "motion": {"model": model(cell.change if cell.way == "native" else "base"), "use": True}
+    }
+    settings["motion"] |= WAYS[cell.way]
+    if cell.sensors == "commands":
+        settings |= {"wheels": {"source": "command"}}
+    dark = [(t, t + _DARK_S) for t in np.arange(_FIXES_S, _DURATION_S - 1.0, 2.0 * _DARK_S).tolist()]
+    chain = [failure({"kind": "dropout", "sensor": "camera", "when": {"intervals": dark}})]
+    began = time.process_time()
+    made = replayed(recorded, changed(recorded.config, settings), chain, cell.seed, batch=False)
+    if made is None:
+        raise FglocError(f"{cell.name}: no pose was ever found")
+    found = errors(made.online, recorded.config)
+    ends = _ends(made.online, recorded, dark)
+    return {
+        "ate_mm": found.ate_mm,
+        "nees_over_3": found.nees_over_3,
+        "ends": ends,
+        "step_ms": 1e3 * (time.process_time() - began) / len(made.steps),
+    }
+
+
+def _ends(result: Any, recorded: Recorded, dark: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Sum of the distances by which the dark stretches end elsewhere than the truth, each begun at it, and of their ways [m]."""
+    trajectory = result.trajectory
+    seconds = (trajectory.stamps_ns - recorded.start_ns) * 1e-9
+    true_s, truth = recorded.truth[:, 0], recorded.truth[:, 1:]
+    missed, way = 0.0, 0.0
+    for start, end in dark:
+        ours = [trajectory.poses[np.searchsorted(seconds, t)] for t in (start, end - 0.3)]
+        at = [float(seconds[np.searchsorted(seconds, t)]) for t in (start, end - 0.3)]
+        theirs = [_at(true_s, truth, t) for t in at]
+        missed += float(np.hypot(*se2.between(se2.between(*ours), se2.between(*theirs))[:2]))
+        inside = (true_s >= at[0]) & (true_s <= at[1])
+        way += float(np.hypot(*np.diff(truth[inside, :2], axis=0).T).sum())
+    return missed, way
+
+
+def _at(times: FloatArray, poses: FloatArray, t: float) -> FloatArray:
+    yaw = np.unwrap(poses[:, 2])
+    return np.array([np.interp(t, times, column) for column in (poses[:, 0], poses[:, 1], yaw)])
+
+
+# --- Robots and models ------------------------------------------------------------------------------------------------
+
+
+def _made(change: str, test: bool) -> tuple[Scenario, str]:
+    """Scenario of the changed robot, as installed and driven otherwise for tests; and a hash of it."""
+    made = scenario("calibrated", "test" if test else "train")
+    robot, floor = made.robot, made.world.floor
+    if change in ("load", "both"):
+        robot = robot.model_copy(update={"payload": Payload(mass_kg=3.0, shift_at_s=1.0)})
+    if change == "wheel":
+        robot = robot.model_copy(update={"radius_scale": (1.0, 0.96)})
+    if change in ("floor", "both"):
+        floor = floor.model_copy(update={"mu": 0.2 if change == "floor" else 0.3})
+    world = made.world.model_copy(update={"floor": floor})
+    installation = Installation.as_installed() if test else None
+    update = {"name": change, "robot": robot, "world": world, "duration_s": _DURATION_S, "installation": installation}
+    made = made.model_copy(update=update)
+    return made, hashlib.sha256(describe(made, 0, test).encode()).hexdigest()[:12]
+
+
+@cache
+def model(change: str) -> Path:
+    """File of the model of a robot of this change (``base``: of none), trained first if it is not there."""
+    made, key = _made(change, False)
+    folder = cache_folder() / "learning"
+    path = folder / f"{change}_{key}.safetensors"
+    if path.is_file():
+        return path
+    control = {
+        part: next(
+            run.control
+            for entry in load_suite(BUNDLED).entries
+            if entry.scenario.name == "calibrated"
+            for run in entry.runs
+            if run.split == part
+        )
+        for part in _TRAIN_SEEDS
+    }
+    jobs = [
+        Job(made.model_copy(update={"control": control[part]}), seed, f"{change}_{key}_{part}_{seed}", part)
+        for part, seeds in _TRAIN_SEEDS.items()
+        for seed in seeds
+    ]
+    record_suite(jobs, folder, camera=False, workers=os.cpu_count() or 1)
+    network = NetworkConfig()
+    runs = {j.folder: load_run(folder / j.folder / "bag", j.folder, network.dt_s, _DATA.history_s, _DATA) for j in jobs}
+    parts = {part: tuple(j.folder for j in jobs if j.split == part) for part in _TRAIN_SEEDS}
+    split = Parts(train=parts["train"], validation=parts["validation"])
+    given = {"robot": f"simulated, {change}", "recordings": {name: Path(name) for name in runs}, "split": split}
+    torch.set_num_threads(1)
+    train(
+        TrainConfig(**given, data=_DATA, network=network, optimization=OptimizationConfig()),
+        split,
+        runs,
+        path,
+        "benchmarks.learning",
+    )  # type: ignore[arg-type]
+    return path
+
+
+# --- Wheels alone in the dark -----------------------------------------------------------------------------------------
+
+
+def _wheels_only(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
+    seeds = SEEDS[split][: 1 if quick else None]
+    cells = list(parallel(_wheels_only_cell, [(split, seed) for seed in seeds], jobs))
+    for mode in ("batch", "online"):
+        yield _row(f"wheels_only.dark60.{mode}.ate_mm", [cell[mode][0] for cell in cells], "mm")
+        yield _row(f"wheels_only.dark60.{mode}.nees_over_3", [cell[mode][1] for cell in cells])
+
+
+def _wheels_only_cell(key: tuple[Split, int]) -> dict[str, Any]:
+    split, seed = key
+    return dict(kept(f"learning_wheels_only_{split}_{seed}", lambda: run_wheels_only(split, seed)))
+
+
+def run_wheels_only(split: Split, seed: int) -> dict[str, Any]:
+    """Error and NEES/3 in batch and online of a robot on slippery patches with nothing but wheels, a minute dark."""
+    recorded = load(Take("installed", "patches", split, seed))
+    recorded = replace(recorded, events=tuple(e for e in recorded.events if not isinstance(e, ImuEvent)))
+    config = changed(recorded.config, {"motion": {"use": False}})
+    made = replayed(recorded, config, failures("dark60", recorded), seed, batch=True)
+    if made is None or made.batch is None:
+        raise FglocError(f"seed {seed}: no pose was ever found")
+    unknown = made.unknown_ns(recorded.start_ns)
+    scores = {mode: errors(getattr(made, mode), config, unknown) for mode in ("batch", "online")}
+    return {mode: (found.ate_mm, found.nees_over_3) for mode, found in scores.items()}
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--split", choices=("validation", "test"), default="test")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    known, rest = parser.parse_known_args()
+    main(lambda quick: measure(quick, known.split, known.jobs), __doc__ or "", rest)
