@@ -599,6 +599,7 @@ def _without(readings: MotionReadings, sources: Collection[str]) -> MotionReadin
 # --- Drift that no other source shows ---
 
 _STRETCH_S = 2.0  # between two fixes that are compared: about as long as errors of slips and of models last
+_LONGEST_S = 10.0  # without a fix; a longer stretch is not compared
 _CALM_S = 30.0  # of driving without any excess that are counted before the run
 _MOST = 0.5  # of the way and of the turn, by which dead reckoning may be off; more is a wrong place
 
@@ -615,6 +616,7 @@ class UnseenDrift:
         """Set up for the estimator, whose installation it knows."""
         self._estimator = estimator
         self._belief: PoseWithCovariance | None = None  # by motion alone, since the fix where the stretch began
+        self._names: tuple[str, ...] = ()  # of the parameters of that belief
         self._stretch_s = self._moving_s = self._unseen_s = 0.0
         self._way = self._turn = 0.0
         self._excess, self._doubt = np.zeros(2), np.zeros(2)  # m², rad²: sums, and what their variances are by chance
@@ -624,10 +626,10 @@ class UnseenDrift:
         """The pose is set anew, or no motion is known to have led there."""
         self._belief = None
 
-    def cov(self, step: Step) -> FloatArray | None:
-        """Covariance ``(3, 3)`` to be added to the motion of a step; None: dead reckoning is as good as it says."""
+    def cov(self, step: Step, motions: Sequence[MotionMeasurement]) -> FloatArray | None:
+        """Covariance ``(3, 3)`` to be added to the motions of a step; None: they are as good as they say, or zero."""
         sure = np.maximum(self._excess - np.sqrt(self._doubt), 0.0)  # m², rad²
-        if not sure.any():
+        if not sure.any() or not any(_moves(m.motion, step.dt) for m in motions):
             return None
         along, turn = sure / self._driven_s
         return np.diag([0.5 * along, 0.5 * along, turn]) * step.dt
@@ -635,15 +637,16 @@ class UnseenDrift:
     def advance(self, step: Step, motions: Sequence[MotionMeasurement]) -> None:
         """Go on by the motions of a step, before sightings are held against them."""
         self._unseen_s += step.dt
-        if self._belief is None or self._unseen_s > _STRETCH_S or not motions:
+        changed = self._names is not self._estimator.installation.names  # rows are of other landmarks now
+        if self._belief is None or self._unseen_s > _LONGEST_S or changed or not motions:
             self._belief = None
             return
         before = self._belief
         self._belief = predict(before, self._estimator.installed, self._estimator.installation, motions)
-        x, y, yaw = se2.between(before.pose, self._belief.pose)
-        self._way, self._turn = self._way + math.hypot(x, y), self._turn + abs(yaw)
+        went = se2.between(before.pose, self._belief.pose)
+        self._way, self._turn = self._way + math.hypot(*went[:2]), self._turn + abs(float(went[2]))
         self._stretch_s += step.dt
-        self._moving_s += step.dt * (math.hypot(x, y) + abs(yaw) > _STANDS * step.dt)
+        self._moving_s += step.dt * _moves(went, step.dt)
 
     def fix(self, belief: PoseWithCovariance) -> None:
         """Compare with a fix at the end of the step, and begin the next stretch there."""
@@ -659,8 +662,12 @@ class UnseenDrift:
             self._excess += error - expected
             self._doubt += 2.0 * expected**2
             self._driven_s += self._moving_s
-        self._belief, self._unseen_s = belief, 0.0
+        self._belief, self._names, self._unseen_s = belief, self._estimator.installation.names, 0.0
         self._stretch_s = self._moving_s = self._way = self._turn = 0.0
+
+
+def _moves(motion: FloatArray, seconds: float) -> bool:
+    return bool(math.hypot(*motion[:2]) + abs(float(motion[2])) > _STANDS * seconds)
 
 
 # --- Judge, and revise past steps -------------------------------------------------------------------------------------
@@ -770,7 +777,7 @@ class MotionJudge:
         factors = tuple(self.combine(step, readings, verdict.budget))
         if self._unseen is not None:
             unwitnessed = source_difference(readings, self.sources) is None and not self._lift.carried
-            drift = self._unseen.cov(step) if unwitnessed else None
+            drift = self._unseen.cov(step, factors) if unwitnessed else None
             self._unseen.advance(step, factors if unwitnessed else ())
             if drift is not None:
                 verdict = replace(verdict, budget=replace(verdict.budget, drift_cov=drift))
