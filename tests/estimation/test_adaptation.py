@@ -1,0 +1,114 @@
+"""A model adapts to the robot that it moves; and what dead reckoning was off by while landmarks were seen goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motion_models import make_card, make_tensors
+from robot_world import START_NS, Chain, World, config, nees, position_error, room
+
+from fgloc import se2
+from fgloc.config import MotionConfig
+from fgloc.graph.installation import Installation, InstallationEstimate
+from fgloc.sensors.learned.sensor import GAINS, LearnedMotion, gains_of, load_model, save_model
+from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.types import ControlEvent, Step, by_class
+
+PULLED = 0.1  # rad/m to the left of what the model says
+COMMANDS = {"wheels": {"source": "command"}}
+
+
+def model_in(folder):
+    card = make_card("naive", kinematics={}, lag=None, joint=None)
+    save_model(folder / "m.safetensors", make_tensors(card, np.random.default_rng(0)), card)
+    return load_model(folder / "m.safetensors")
+
+
+def step_of(v: float, omega: float) -> Step:
+    events = tuple(ControlEvent(t, t, "/cmd_vel", v, omega) for t in range(0, 10**9, 10**8))
+    return Step(0, 0, 7 * 10**8, 9 * 10**8, by_class(events))
+
+
+def pulled(folder, seed=0, blind=(), **motion):
+    """A robot of commands alone that does not go as its model says; the model says what it is told."""
+    settings = config(**COMMANDS, motion=motion)
+    made = World(room(), seed=seed, seconds=24.0, blind=blind)
+    chain = Chain(settings, made.map, learned=LearnedMotion(model_in(folder), settings.motion))
+    events = [e for e in made.events() if not isinstance(e, OdometryEvent)]
+    told = (replace(e, omega=e.omega - PULLED * e.v) if isinstance(e, ControlEvent) else e for e in events)
+    return made, chain.localizer, chain.run(told)
+
+
+@pytest.mark.parametrize("gain", GAINS)
+def test_a_configured_gain_moves_the_motion_along_its_derivative(tmp_path, gain):
+    model, step, change = model_in(tmp_path), step_of(0.4, 0.7), 1e-4
+    motion, by = LearnedMotion(model, MotionConfig()).measure_adapted(step)
+    given = {gain: getattr(MotionConfig(), gain) + change}
+    changed, _ = LearnedMotion(model, MotionConfig(**given)).measure_adapted(step)
+    moved = (se2.log(changed.motion) - se2.log(motion.motion)) / change
+    assert moved == pytest.approx(by[f"learned.{gain}"], abs=1e-6)
+    assert np.abs(moved).max() > 0.01
+
+
+def test_turns_of_a_model_that_reads_a_gyro_are_not_adapted():
+    joints = {"left": "l", "right": "r", "left_radius": 0.1, "right_radius": 0.1, "track": 0.3}
+    assert gains_of(make_card("displacement")) == GAINS
+    assert gains_of(make_card("displacement", inputs=("commands", "gyro"))) == ("scale",)
+    assert gains_of(make_card("displacement", inputs=("commands", "wheels"), joints=joints)) == ("scale",)
+
+
+def test_a_robot_that_is_drawn_aside_is_followed_in_the_dark(tmp_path):
+    last = {}
+    for name, motion in {"adapted": {}, "frozen": {"adaptation_sigma": 0.0}}.items():
+        ends = []
+        for seed in range(2):
+            made, localizer, estimates = pulled(tmp_path, seed, ((14.0, 24.0),), **motion)
+            ends.append(position_error(estimates[-1], made.truth(estimates[-1].stamp_ns)))
+        last[name] = float(np.mean(ends))
+        assert not localizer.estimator.contradicted
+    assert last["adapted"] < 0.35 * last["frozen"]
+
+
+def test_what_a_run_has_learned_is_a_setting_of_the_next(tmp_path):
+    made, localizer, _ = pulled(tmp_path)
+    index, mean = localizer.factors.installation.index, localizer.factors.estimated.mean
+    found = {gain: float(mean[index[f"learned.{gain}"]]) for gain in ("turn_scale", "yaw_per_m")}
+    made, localizer, estimates = pulled(
+        tmp_path,
+        blind=((4.0, 24.0),),
+        adaptation_sigma=0.0,
+        turn_scale=1.0 + found["turn_scale"],
+        yaw_per_m=found["yaw_per_m"],
+    )
+    _, _, as_it_was = pulled(tmp_path, blind=((4.0, 24.0),), adaptation_sigma=0.0)
+    told, untold = (position_error(e[-1], made.truth(e[-1].stamp_ns)) for e in (estimates, as_it_was))
+    assert told < 0.35 * untold
+
+
+def test_a_constant_that_floor_and_load_change_has_a_wider_gate_than_its_prior():
+    names = {"wheels.radius": 0.01, "learned.turn_scale": 0.01}
+    installation = Installation(names, gates={"learned.turn_scale": 0.05})
+    known = InstallationEstimate(np.array([0.2, 0.2]), 1e-8 * np.eye(2))
+    assert installation.beyond_gate(known) == ("wheels.radius",)
+    known = InstallationEstimate(np.array([0.0, 0.4]), 1e-8 * np.eye(2))
+    assert installation.beyond_gate(known) == ("learned.turn_scale",)
+
+
+SLIPS = tuple((t, t + 0.4) for t in np.arange(1.0, 30.0, 2.0).tolist())
+
+
+def in_the_dark(slips, seed=0):
+    """Mean NEES over 3 of wheels alone in the dark of the last 15 s, and the largest sigma [m]."""
+    made = World(room(), seed=seed, seconds=30.0, slips=slips, blind=((15.0, 30.0),))
+    estimates = Chain(config(), made.map).run(made.events())
+    dark = [e for e in estimates if e.stamp_ns > START_NS + 16 * 10**9]
+    sizes = [nees(e, made.truth(e.stamp_ns)) / 3.0 for e in dark]
+    return float(np.mean(sizes)), max(float(np.sqrt(e.cov[0, 0])) for e in dark)
+
+
+def test_wheels_alone_that_slipped_while_seen_are_trusted_less_in_the_dark():
+    sound, slipping = ([in_the_dark(slips, seed) for seed in range(2)] for slips in ((), SLIPS))
+    assert min(sigma for _, sigma in slipping) > 3.0 * max(sigma for _, sigma in sound)
+    assert np.mean([size for size, _ in slipping]) < 6.0  # all slips are forwards; 120 if they are forgotten
