@@ -44,7 +44,7 @@ def found_values(
 ) -> Found:
     """Values with their sigmas, by name.
 
-    - ``wheels.radius_scale``, ``.track_scale``, ``gyro.scale`` (reported over true), ``learned.scale``;
+    - ``wheels.radius_scale``, ``.track_scale``, ``gyro.scale`` (reported over true), ``learned.scale`` and other gains;
       ``wheels.radius_ratio``: left over right, where the track is known, else ``wheels.yaw_per_m`` [rad/m];
     - ``camera.time_offset_s``, ``wheels.time_offset_s``, ``sightings.time_offset_s``: how much later than the gyro's
       (without a gyro: the wheels') their stamps are; ``sightings.range_scale``, ``.bearing_offset_rad``;
@@ -258,7 +258,8 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
     for s in settings:
         if s.name in sigmas:
             put(s.name, round(s.found, 7))
-            spread(sigmas[s.name], s.sigma / (s.given if "scale" in s.name else 1.0))
+            if sigmas[s.name]:
+                spread(sigmas[s.name], s.sigma / (s.given if "scale" in s.name else 1.0))
     of_drive = {s.name.removeprefix(DRIVE): s for s in settings if s.name.startswith(DRIVE)}
     if of_drive and config.wheels.drive is not None:
         values = {name: round(s.found, 9) for name, s in of_drive.items()}

@@ -362,7 +362,7 @@ class MotionInstallation:
         parameters: with their priors, from all settings and the names of the motion sources that there are.
         found: rows of ``metrics.json``, from all settings.
         settings: the lines of ``robot.yaml`` that a run makes of what it found.
-        sigmas: the setting that takes the sigma of another one back, by that one.
+        sigmas: the setting that takes the sigma of another one back, by that one; "": none does, as it changes again.
     """
 
     parameters: Callable[[Config, Collection[str]], tuple[Parameter, ...]]

@@ -227,7 +227,8 @@ def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
         yield from state.setting(f"motion.{gain}", given, now, {f"learned.{gain}": factor})
 
 
-INSTALLATION = MotionInstallation(_parameters, _found_rows, _settings, {"motion.scale": "motion.scale_sigma"})
+_SIGMAS = {"motion.scale": "motion.scale_sigma", "motion.turn_scale": "", "motion.yaw_per_m": ""}
+INSTALLATION = MotionInstallation(_parameters, _found_rows, _settings, _SIGMAS)
 
 
 class LearnedMotion:
