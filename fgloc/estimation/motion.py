@@ -601,6 +601,7 @@ def _without(readings: MotionReadings, sources: Collection[str]) -> MotionReadin
 _STRETCH_S = 2.0  # between two fixes that are compared: about as long as errors of slips and of models last
 _LONGEST_S = 10.0  # without a fix; a longer stretch is not compared
 _CALM_S = 30.0  # of driving without any excess that are counted before the run
+_VAGUE = 0.25  # m², rad²: a stretch that is expected to be off by more says nothing
 _MOST = 0.5  # of the way and of the turn, by which dead reckoning may be off; more is a wrong place
 
 
@@ -659,9 +660,10 @@ class UnseenDrift:
             error = np.minimum([math.hypot(x, y), abs(yaw)], most) ** 2
             P = self._belief.cov + belief.cov
             expected = np.array([P[0, 0] + P[1, 1], P[2, 2]])
-            self._excess += error - expected
-            self._doubt += 2.0 * expected**2
-            self._driven_s += self._moving_s
+            if (expected < _VAGUE).all():
+                self._excess += error - expected
+                self._doubt += 2.0 * expected**2
+                self._driven_s += self._moving_s
         self._belief, self._names, self._unseen_s = belief, self._estimator.installation.names, 0.0
         self._stretch_s = self._moving_s = self._way = self._turn = 0.0
 
@@ -778,7 +780,7 @@ class MotionJudge:
         if self._unseen is not None:
             unwitnessed = source_difference(readings, self.sources) is None and not self._lift.carried
             drift = self._unseen.cov(step, factors) if unwitnessed else None
-            self._unseen.advance(step, factors if unwitnessed else ())
+            self._unseen.advance(step, factors if unwitnessed and factors[0].source != "unknown" else ())
             if drift is not None:
                 verdict = replace(verdict, budget=replace(verdict.budget, drift_cov=drift))
                 factors = tuple(self.combine(step, readings, verdict.budget))
