@@ -57,10 +57,10 @@ from fgloc_training.train import train
 
 CHANGES = ("floor", "load", "wheel", "both")
 WAYS: dict[str, dict[str, Any]] = {
+    "none": {"use": False},  # first: what a process does only once is not counted as adaptation
     "adapted": {},
     "frozen": {"adaptation_sigma": 0.0, "scale_sigma": 0.0},
     "native": {},
-    "none": {"use": False},
 }
 SENSORS: dict[str, tuple[type[Event], ...]] = {  # what a robot with these lacks
     "commands": (OdometryEvent, JointsEvent, ImuEvent),

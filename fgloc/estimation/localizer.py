@@ -361,7 +361,8 @@ class Recorder:
         if self._motion.is_carried and frame.mode is Mode.OK and tracking.since_fix_s > 0.0:
             frame.mode = Mode.DEAD_RECKONING
         twist = self._compensation.twist(step, step.stamp_ns)
-        by_clock = np.asarray(np.outer(twist, twist) * self._clock_variance)
+        clock_variance = self._clock_sigma_s**2 + self._motion.sources.clock_sigma_s(frame) ** 2
+        by_clock = np.asarray(np.outer(twist, twist) * clock_variance)
         carried, around = tracking.kidnapped(self._sightings.contradicting, belief)
         frame.added_cov = by_clock
         frame.carried_cov = carried * around  # of a mixture of two Gaussians, the second one wide
@@ -373,7 +374,7 @@ class Recorder:
         cov = se2.rotate_cov(belief.cov + added, float(belief.pose[2]))
         ground = spatial(belief, self._installation, added)
         if ground is not None:
-            frame.ground_clock_cov = self._ground_by_clock(step, ground)
+            frame.ground_clock_cov = self._ground_by_clock(step, ground, clock_variance)
             ground = replace(ground, cov=ground.cov + frame.ground_clock_cov)
         pose = belief.pose
         if self._frame is not None:
@@ -396,19 +397,14 @@ class Recorder:
         )
         return Estimate(step.stamp_ns, pose, cov, frame.mode, (*before, *decisions, *modes), ground, protection)
 
-    @property
-    def _clock_variance(self) -> float:
-        """Variance of the clock [s²], of the recording and of the motion sources."""
-        return self._clock_sigma_s**2 + self._motion.sources.clock_sigma_s**2
-
-    def _ground_by_clock(self, step: Step, ground: Ground) -> FloatArray:
+    def _ground_by_clock(self, step: Step, ground: Ground, clock_variance: float) -> FloatArray:
         """Covariance ``(6, 6)`` of height, roll and pitch for a clock that is off, as `record` has it of x, y, yaw."""
         now, before = np.array([ground.z, ground.roll, ground.pitch]), self._last_ground
         self._last_ground = now
         rates: FloatArray = np.zeros(6)
         if before is not None and step.dt > 0.0:
             rates[2:5] = (now - before) / step.dt
-        return np.asarray(np.outer(rates, rates) * self._clock_variance)
+        return np.asarray(np.outer(rates, rates) * clock_variance)
 
     def unconfirmed(self, k: int, step: Step) -> Estimate | None:
         """Estimate before the sightings suffice to begin the graph; None: it is too uncertain."""

@@ -25,7 +25,7 @@ from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import planar_turn, predict
 from fgloc.graph.joint import FAR_M2
 from fgloc.graph.measurement_log import Keyframe, PoseWithCovariance
-from fgloc.graph.noise import COVARIANCE_FACTOR, DOUBTED, FusionRules, NoiseBudget, with_yaw
+from fgloc.graph.noise import COVARIANCE_FACTOR, DOUBTED, FusionRules, NoiseBudget, moves, with_yaw
 from fgloc.sensors.base import Turn
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.learned.sensor import left_out_note
@@ -146,11 +146,10 @@ class MotionSources:
         others = (self.learned_is_independent and readings.learned is not None) or bool(readings.beside)
         return readings.wheels is not None and others and not {"wheels", "learned"} & set(rejected)
 
-    @property
-    def clock_sigma_s(self) -> float:
-        """Sigma of the clock by which the robot is seen to move [s]: that of a model of commands is its own delay."""
-        by_model = self._wheels.from_commands and self._learned is not None and self._turn is None
-        return _MODEL_CLOCK_S if by_model else 0.0
+    def clock_sigma_s(self, frame: Keyframe) -> float:
+        """Sigma of the clock by which the robot moved to a keyframe [s]: of a model of commands that of its delay."""
+        by_model = self._wheels.from_commands and any(m.source == "learned" for m in frame.motions)
+        return _MODEL_CLOCK_S if by_model and frame.readings.gyro is None else 0.0
 
     @property
     def learned_is_independent(self) -> bool:
@@ -395,7 +394,6 @@ _MOVED = 0.25  # of the reference source's travel: a wheel that turned less stoo
 _LEAST_M = 0.15
 KNOWN = "distrusted"  # a failure that the configuration states
 CONTRADICTED = "contradicted"  # by sightings: why a motion model is rejected
-_STANDS = 0.01  # m/s or rad/s: slower, a robot stands
 _PROVEN_M = 0.5  # way over which wheels and model have agreed before the model may accuse the wheels
 
 
@@ -601,6 +599,7 @@ def _without(readings: MotionReadings, sources: Collection[str]) -> MotionReadin
 _STRETCH_S = 2.0  # between two fixes that are compared: about as long as errors of slips and of models last
 _LONGEST_S = 10.0  # without a fix; a longer stretch is not compared
 _CALM_S = 30.0  # of driving without any excess that are counted before the run
+_REMEMBERED_S = 600.0  # of driving, after which floor and load may be others
 _VAGUE = 0.25  # m², rad²: a stretch that is expected to be off by more says nothing
 _MOST = 0.5  # of the way and of the turn, by which dead reckoning may be off; more is a wrong place
 
@@ -621,19 +620,20 @@ class UnseenDrift:
         self._stretch_s = self._moving_s = self._unseen_s = 0.0
         self._way = self._turn = 0.0
         self._excess, self._doubt = np.zeros(2), np.zeros(2)  # m², rad²: sums, and what their variances are by chance
-        self._driven_s = _CALM_S
+        self._driven_s = 0.0
 
     def forget_fix(self) -> None:
         """The pose is set anew, or no motion is known to have led there."""
         self._belief = None
 
-    def cov(self, step: Step, motions: Sequence[MotionMeasurement]) -> FloatArray | None:
-        """Covariance ``(3, 3)`` to be added to the motions of a step; None: they are as good as they say, or zero."""
+    @property
+    def density(self) -> FloatArray | None:
+        """Densities ``(3,)`` of the noise to add, see `NoiseBudget`; None: dead reckoning is as good as it says."""
         sure = np.maximum(self._excess - np.sqrt(self._doubt), 0.0)  # m², rad²
-        if not sure.any() or not any(_moves(m.motion, step.dt) for m in motions):
+        if not sure.any():
             return None
-        along, turn = sure / self._driven_s
-        return np.diag([0.5 * along, 0.5 * along, turn]) * step.dt
+        along, turn = sure / (_CALM_S + self._driven_s)
+        return np.array([0.5 * along, 0.5 * along, turn])
 
     def advance(self, step: Step, motions: Sequence[MotionMeasurement]) -> None:
         """Go on by the motions of a step, before sightings are held against them."""
@@ -647,7 +647,7 @@ class UnseenDrift:
         went = se2.between(before.pose, self._belief.pose)
         self._way, self._turn = self._way + math.hypot(*went[:2]), self._turn + abs(float(went[2]))
         self._stretch_s += step.dt
-        self._moving_s += step.dt * _moves(went, step.dt)
+        self._moving_s += step.dt * moves(went, step.dt)
 
     def fix(self, belief: PoseWithCovariance) -> None:
         """Compare with a fix at the end of the step, and begin the next stretch there."""
@@ -661,15 +661,12 @@ class UnseenDrift:
             P = self._belief.cov + belief.cov
             expected = np.array([P[0, 0] + P[1, 1], P[2, 2]])
             if (expected < _VAGUE).all():
-                self._excess += error - expected
-                self._doubt += 2.0 * expected**2
-                self._driven_s += self._moving_s
+                kept = math.exp(-self._moving_s / _REMEMBERED_S)
+                self._excess = kept * self._excess + error - expected
+                self._doubt = kept**2 * self._doubt + 2.0 * expected**2
+                self._driven_s = kept * self._driven_s + self._moving_s
         self._belief, self._names, self._unseen_s = belief, self._estimator.installation.names, 0.0
         self._stretch_s = self._moving_s = self._way = self._turn = 0.0
-
-
-def _moves(motion: FloatArray, seconds: float) -> bool:
-    return bool(math.hypot(*motion[:2]) + abs(float(motion[2])) > _STANDS * seconds)
 
 
 # --- Judge, and revise past steps -------------------------------------------------------------------------------------
@@ -778,11 +775,12 @@ class MotionJudge:
             revisions = (*revisions, *left_out)
         factors = tuple(self.combine(step, readings, verdict.budget))
         if self._unseen is not None:
-            unwitnessed = source_difference(readings, self.sources) is None and not self._lift.carried
-            drift = self._unseen.cov(step, factors) if unwitnessed else None
+            witnessed = source_difference(readings, self.sources) is not None or bool(readings.beside)
+            unwitnessed = not witnessed and not self._lift.carried
+            drift = self._unseen.density if unwitnessed else None
             self._unseen.advance(step, factors if unwitnessed and factors[0].source != "unknown" else ())
             if drift is not None:
-                verdict = replace(verdict, budget=replace(verdict.budget, drift_cov=drift))
+                verdict = replace(verdict, budget=replace(verdict.budget, drift=drift))
                 factors = tuple(self.combine(step, readings, verdict.budget))
         if self._lift.carried:
             return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)

@@ -242,6 +242,7 @@ class Installation:
         No landmark, and none that is taken as exact.
 
         What measurements say lies beyond what was found, which the prior pulls: as `Setting.off` has it.
+        The gate of a constant of `gates` is no narrower than that.
         """
         rows = self._gated
         off = np.abs(belief.mean[rows] - self._prior_mean[rows])

@@ -116,6 +116,7 @@ def covariance_problem(cov: FloatArray) -> str:
 DOUBTED = "doubted"  # why wheels and a model that differ are both rejected, where nothing tells which of them is wrong
 _SLIP = 0.1  # m/s, rad/s: a slipping wheel may be this wrong even when it hardly turns ...
 _WRONG_LASTS_S = 1.0  # ... for this long in one direction
+_STANDS = 0.01  # m/s, rad/s: slower, a robot stands
 _REST_PER_SQRT_S = 3e-5  # m/√s, rad/√s of a robot whose wheels and gyro rest: 2 mm in an hour, by its floor and tyres
 # What a motion's covariance may be off by: squared errors of the learned motion over 1 s of a slip are 2 to 5 times it.
 COVARIANCE_FACTOR = 4.0
@@ -151,14 +152,14 @@ class NoiseBudget:
         rejected: sources that are left out, and why.
         scale: on the covariance of the wheels, as they and the other sources differ. The learned motion's follows.
         overruled_cov: ``(3, 3)`` added to each factor, as sightings found the motion wrong; None: they did not.
-        drift_cov: ``(3, 3)`` added to each factor, as dead reckoning was further off between fixes than its covariance
-            says; None: it was not.
+        drift: densities ``(3,)`` [m²/s, m²/s, rad²/s] that are added to the motion of a robot that moves, as dead
+            reckoning was further off between fixes than its covariance says; None: it was not.
     """
 
     rejected: Mapping[str, str] = field(default_factory=dict)
     scale: float = 1.0
     overruled_cov: FloatArray | None = None
-    drift_cov: FloatArray | None = None
+    drift: FloatArray | None = None
 
     @property
     def scales(self) -> dict[str, float]:
@@ -202,14 +203,14 @@ class NoiseBudget:
             elif rules.joint is not None:
                 learned = rules.joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned, *beside) if m is not None]
+        if self.drift is not None:
+            known = [drifting(m, len(known) * self.drift) for m in known]
         if gyro is not None and known:
             if rules.turns_by_gyro:
                 known = [replace(m, cov=m.cov + np.diag([0.0, 0.0, se2.ANY_YAW * (m not in beside)])) for m in known]
             known.append(replace(gyro, motion=with_yaw(known[0].motion, float(gyro.motion[2]))))
         if readings.inertial is not None:
             known = [replace(m, inertial=readings.inertial) for m in known]
-        if self.drift_cov is not None:
-            known = [replace(m, cov=m.cov + self.drift_cov) for m in known]
         return [self.overruled(m) for m in known]
 
     def overruled(self, m: MotionMeasurement) -> MotionMeasurement:
@@ -228,6 +229,17 @@ class NoiseBudget:
         turn = max(turn, abs(float(wheels.motion[2])) / seconds)
         density = np.square([speed, speed, turn])
         return replace(wheels, cov=wheels.cov + np.diag(density * _WRONG_LASTS_S * seconds))
+
+
+def moves(motion: FloatArray, seconds: float) -> bool:
+    """Whether a motion ``(3,)`` over so long is more than that of a robot that stands."""
+    return bool(math.hypot(*motion[:2]) + abs(float(motion[2])) > _STANDS * seconds)
+
+
+def drifting(m: MotionMeasurement, density: FloatArray) -> MotionMeasurement:
+    """The motion with noise of these densities ``(3,)``, if it is one."""
+    seconds = (m.stamp_ns - m.start_ns) * 1e-9
+    return replace(m, cov=m.cov + np.diag(density * seconds)) if moves(m.motion, seconds) else m
 
 
 def with_yaw(motion: FloatArray, yaw: float) -> FloatArray:

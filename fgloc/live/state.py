@@ -129,6 +129,8 @@ def read_state(path: Path, map_fingerprint: str, remedy: str = _FRESH) -> Resume
 def resumed_installation(saved: InstallationState, installation: Installation) -> InstallationEstimate | None:
     """Saved estimate of the installation, but for the ground; None if the parameters are not the same.
 
+    Gains of a learned motion may come and go, with a model or a setting: those that were not saved keep their prior.
+
     Of a map with more landmarks than can be states, those are that were, as far as there are rows for them.
     """
     at = {name: i for i, name in enumerate(saved.names) if name not in GROUND and not is_vacant(name)}
@@ -136,9 +138,11 @@ def resumed_installation(saved: InstallationState, installation: Installation) -
         if landmark_id in installation.stateless and installation.vacancies:
             installation.occupy(landmark_id)
     here = {name: i for i, name in enumerate(installation.names[: installation.constants]) if not is_vacant(name)}
+    gains = {name for name in (*at, *here) if name.startswith("learned.")}
     left_out = [name for name in at if name not in here and not (installation.stateless and name.startswith("map."))]
-    if not at or here.keys() - at.keys() or left_out:
+    if not at or here.keys() - at.keys() - gains or set(left_out) - gains:
         return None
+    here = {name: i for name, i in here.items() if name in at}
     prior, rows, to = installation.prior(), [at[name] for name in here], list(here.values())
     prior.mean[to] = np.array(saved.mean)[rows]
     prior.cov[np.ix_(to, to)] = np.array(saved.cov)[np.ix_(rows, rows)]

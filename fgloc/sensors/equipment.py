@@ -159,7 +159,8 @@ def _tilt(rates: FloatArray, seconds: float) -> FloatArray:
 class MotionCompensation:
     """Moves sightings from their exposure to the keyframe, by the wheels and, where it is measured, the gyro's turn.
 
-    Where commands stand in for wheels, a model of the same commands takes their place: a robot follows them late.
+    Where commands stand in for wheels, a model of the same commands takes their place, if it tells the motion between
+    any two times: a robot follows its commands late.
     """
 
     def __init__(self, poses: PoseSensors, motion: MotionSensors, jitter_s: float) -> None:

@@ -10,11 +10,15 @@ from motion_models import make_card, make_tensors
 from robot_world import START_NS, Chain, World, config, nees, position_error, room
 
 from fgloc import se2
-from fgloc.config import MotionConfig
+from fgloc.config import Config, MotionConfig
 from fgloc.graph.installation import Installation, InstallationEstimate
-from fgloc.sensors.learned.sensor import GAINS, LearnedMotion, gains_of, load_model, save_model
+from fgloc.graph.noise import FusionRules, NoiseBudget
+from fgloc.live.state import InstallationState as State
+from fgloc.live.state import resumed_installation
+from fgloc.sensors.base import InstallationState
+from fgloc.sensors.learned.sensor import GAINS, INSTALLATION, LearnedMotion, gains_of, load_model, save_model
 from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import ControlEvent, Step, by_class
+from fgloc.types import ControlEvent, InstallationFound, MotionMeasurement, MotionReadings, Step, by_class
 
 PULLED = 0.1  # rad/m to the left of what the model says
 COMMANDS = {"wheels": {"source": "command"}}
@@ -50,6 +54,42 @@ def test_a_configured_gain_moves_the_motion_along_its_derivative(tmp_path, gain)
     moved = (se2.log(changed.motion) - se2.log(motion.motion)) / change
     assert moved == pytest.approx(by[f"learned.{gain}"], abs=1e-6)
     assert np.abs(moved).max() > 0.01
+
+
+def test_gains_that_a_run_found_are_the_settings_under_which_nothing_is_left_to_find(tmp_path):
+    model, step = model_in(tmp_path), step_of(0.4, 0.7)
+    given = MotionConfig(scale=1.2, turn_scale=1.5, yaw_per_m=0.2)
+    motion, by = LearnedMotion(model, given).measure_adapted(step)
+    found = np.array([0.01, 0.02, -0.03])
+    cov, settings = np.eye(3), Config(motion=given)
+    names = tuple(f"learned.{gain}" for gain in GAINS)
+    state = InstallationState(InstallationFound(names, found, cov, cov, (), "", ""))
+    next_run = {s.name.removeprefix("motion."): s.found for s in INSTALLATION.settings(state, settings)}
+    now, _ = LearnedMotion(model, MotionConfig(**next_run)).measure_adapted(step)
+    moved = se2.log(motion.motion) + sum(value * by[name] for name, value in zip(names, found, strict=True))
+    assert se2.log(now.motion) == pytest.approx(moved, abs=1e-9)
+    between, _ = LearnedMotion(model, given).motion_between(step, step.start_ns, step.stamp_ns)
+    assert between == pytest.approx(motion.motion)
+
+
+def test_noise_of_drift_grows_with_the_time_and_with_nothing_at_rest():
+    budget, rules = NoiseBudget(drift=np.array([1.0, 1.0, 2.0])), FusionRules()
+    for seconds in (0.001, 0.2):
+        end = round(seconds * 1e9)
+        driving = MotionMeasurement("wheels", 0, end, np.array([0.5 * seconds, 0.0, 0.0]), 1e-9 * np.eye(3))
+        (made,) = budget.combine(MotionReadings(driving), rules)
+        assert np.diag(made.cov) == pytest.approx(seconds * np.array([1.0, 1.0, 2.0]), rel=1e-3)
+        (still,) = budget.combine(MotionReadings(replace(driving, motion=np.zeros(3))), rules)
+        assert np.diag(still.cov).max() < 1e-8
+
+
+def test_a_saved_state_without_the_gains_of_a_model_is_resumed(tmp_path):
+    saved = State(names=("wheels.radius", "learned.scale"), mean=(0.01, 0.02), cov=((1e-6, 0.0), (0.0, 1e-6)))
+    here = Installation({"wheels.radius": 0.02, "learned.turn_scale": 0.03})
+    resumed = resumed_installation(saved, here)
+    assert resumed.mean == pytest.approx([0.01, 0.0])
+    assert np.diag(resumed.cov) == pytest.approx([1e-6, 9e-4])
+    assert resumed_installation(saved, Installation({"wheels.track": 0.02})) is None
 
 
 def test_turns_of_a_model_that_reads_a_gyro_are_not_adapted():

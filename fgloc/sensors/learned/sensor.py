@@ -185,6 +185,7 @@ def _check(tensors: Tensors, card: ModelCard, path: Path) -> None:
 
 GAINS = ("scale", "turn_scale", "yaw_per_m")
 """What this robot does otherwise than the one that the model is of: settings, and parameters of the installation."""
+_AS_ITS_MODEL = (1.0, 1.0, 0.0)
 _GATE_SIGMA = 0.05  # share, rad/m: floor, load and battery change a robot by more than its prior, not by six of it
 
 
@@ -197,6 +198,7 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
     """Gains of the learned motion with their priors, those that ``sources`` names as ``learned.GAIN``."""
     motion = config.motion
     sigmas = {gain: motion.scale_sigma if gain == "scale" else motion.adaptation_sigma for gain in GAINS}
+    adapts = motion.adaptation_sigma > 0.0 and "learned.turn_scale" in sources
     return tuple(
         Parameter(
             f"learned.{gain}",
@@ -204,7 +206,7 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
             Rank.MODEL,
             ("length",) if gain == "scale" else ("turn",),
             lengthens=gain == "scale",
-            gate_sigma=_GATE_SIGMA if motion.adaptation_sigma > 0.0 else 0.0,
+            gate_sigma=_GATE_SIGMA if adapts else 0.0,
         )
         for gain, sigma in sigmas.items()
     )
@@ -212,9 +214,11 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
 
 def _found_rows(config: Config) -> tuple[FoundRow, ...]:
     """Rows of ``metrics.json`` on the learned motion."""
-    return tuple(
-        FoundRow(f"learned.{gain}", f"learned.{gain}", 1.0 if gain == "scale" else getattr(config.motion, gain), 1.0)
-        for gain in GAINS
+    turn = config.motion.turn_scale
+    return (
+        FoundRow("learned.scale", "learned.scale", 1.0, 1.0),
+        FoundRow("learned.turn_scale", "learned.turn_scale", turn, turn),
+        FoundRow("learned.yaw_per_m", "learned.yaw_per_m", config.motion.yaw_per_m, 1.0),
     )
 
 
@@ -224,7 +228,8 @@ def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
         given = getattr(config.motion, gain)
         factor = given if gain.endswith("scale") else 1.0
         now = given + factor * state.value(f"learned.{gain}")
-        yield from state.setting(f"motion.{gain}", given, now, {f"learned.{gain}": factor})
+        for s in state.setting(f"motion.{gain}", given, now, {f"learned.{gain}": factor}):
+            yield s if gain == "scale" else replace(s, prior_sigma=max(s.prior_sigma, _GATE_SIGMA))
 
 
 _SIGMAS = {"motion.scale": "motion.scale_sigma", "motion.turn_scale": "", "motion.yaw_per_m": ""}
@@ -255,9 +260,9 @@ class LearnedMotion:
         self.rejections: Counter[str] = Counter()
         self._use = config.use
         self._reader = SignalReader(model.card, imu_up)
-        self._gains = {f"learned.{gain}": getattr(config, gain) - (gain.endswith("scale")) for gain in GAINS}
+        self._gains = config.scale, config.turn_scale, config.yaw_per_m
         # A velocity model carries its velocity from step to step; measured signals are known for the step alone
-        self._at_any_time = model.card.family == "displacement" and model.card.inputs == ("commands",)
+        self._at_any_time = model.card.family != "velocity" and model.card.inputs == ("commands",)
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
 
@@ -323,31 +328,40 @@ class LearnedMotion:
         m = self.measure(step, gyro_bias)
         if m is None:
             return None
-        moved = se2.log(m.motion)
-        rho_x, rho_y, turn = moved
+        ahead, left, turn, pulled = self._moved(m.motion)
         by = {
-            "learned.scale": np.array([rho_x, rho_y, 0.0]),
+            "learned.scale": np.array([ahead, left, 0.0]),
             "learned.turn_scale": np.array([0.0, 0.0, turn]),
-            "learned.yaw_per_m": np.array([0.0, 0.0, rho_x]),
+            "learned.yaw_per_m": np.array([0.0, 0.0, float(se2.log(m.motion)[0])]),
         }
-        if any(self._gains.values()):
-            moved = moved + sum(gain * by[name] for name, gain in self._gains.items())
-            m = replace(m, motion=se2.exp(moved))
+        if self._gains != _AS_ITS_MODEL:
+            m = replace(m, motion=se2.exp(np.array([ahead, left, turn + pulled])))
         return m, by
+
+    def _moved(self, motion: FloatArray) -> tuple[float, float, float, float]:
+        """Logarithm of a motion of the model for this robot: way, way to the left, turn, and turn by being pulled."""
+        scale, turn_scale, yaw_per_m = self._gains
+        ahead, left, turn = se2.log(motion).tolist()
+        return scale * ahead, scale * left, turn_scale * turn, yaw_per_m * ahead
 
     def motion_between(self, step: Step, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """Motion ``(3,)`` and covariance ``(3, 3)`` from one time to another near the step's end, which may be earlier.
 
         Returns:
-            None if the model reads more than commands, is not used or cannot predict.
+            None if the model reads more than commands, carries its velocity from step to step, is not used or cannot
+            predict.
         """
         if not (self._use and self._at_any_time) or start_ns == end_ns or self._unusable(step):
             return None
         found = self.model.predict(step.controls, min(start_ns, end_ns), max(start_ns, end_ns), None)
-        if found is None or start_ns < end_ns:
-            return None if found is None else (found.motion, found.cov)
-        ad = se2.adjoint(found.motion)
-        return se2.inverse(found.motion), np.asarray(ad @ found.cov @ ad.T)
+        if found is None:
+            return None
+        ahead, left, turn, pulled = self._moved(found.motion)
+        motion = se2.exp(np.array([ahead, left, turn + pulled]))
+        if start_ns < end_ns:
+            return motion, found.cov
+        ad = se2.adjoint(motion)
+        return se2.inverse(motion), np.asarray(ad @ found.cov @ ad.T)
 
     def _unusable(self, step: Step) -> str:
         for command in reversed(step.controls):
