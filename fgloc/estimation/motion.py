@@ -151,6 +151,13 @@ class MotionSources:
         by_model = self._wheels.from_commands and any(m.source == "learned" for m in frame.motions)
         return _MODEL_CLOCK_S if by_model and frame.readings.gyro is None else 0.0
 
+    def is_witnessed(self, readings: MotionReadings) -> bool:
+        """Whether the wheels of a step can be held against another source, or there is an odometry beside them."""
+        if readings.wheels is None or self._wheels.from_commands:
+            return bool(readings.beside)
+        by_model = readings.learned is not None and self.learned_is_independent
+        return by_model or readings.gyro is not None or bool(readings.beside)
+
     @property
     def learned_is_independent(self) -> bool:
         """Whether the learned motion can be held against the wheels: it does not read them."""
@@ -722,7 +729,9 @@ class MotionJudge:
         if sensors.beside:
             self.sources.beside = OdometriesBeside(config.weights, sensors.beside, estimator.factors, by_sightings)
         self._lift = LiftMonitor(config.estimator.lag_s, None if sensors.gyro is None else sensors.gyro.up)
-        self._unseen = UnseenDrift(estimator) if config.weights.adaptive and not estimator.installation.ground else None
+        # Of all motion sources together, where none shows the errors of another; and of the learned motion by itself
+        flat = config.weights.adaptive and not estimator.installation.ground
+        self._drifts = (UnseenDrift(estimator), UnseenDrift(estimator)) if flat else None
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
     def begin_segment(self, step: Step) -> None:
@@ -743,8 +752,8 @@ class MotionJudge:
 
     def _forget_fix(self) -> None:
         self.sources.begin_segment()
-        if self._unseen is not None:
-            self._unseen.forget_fix()
+        for drift in self._drifts or ():
+            drift.forget_fix()
 
     def read(self, step: Step, since_fix_s: float) -> MotionReadings:
         """Read every source once; one without data yields nothing.
@@ -774,19 +783,30 @@ class MotionJudge:
             verdict, left_out = self._judge_beside(step, readings, verdict)
             revisions = (*revisions, *left_out)
         factors = tuple(self.combine(step, readings, verdict.budget))
-        if self._unseen is not None:
-            witnessed = source_difference(readings, self.sources) is not None or bool(readings.beside)
-            unwitnessed = not witnessed and not self._lift.carried
-            drift = self._unseen.density if unwitnessed else None
-            self._unseen.advance(step, factors if unwitnessed and factors[0].source != "unknown" else ())
-            if drift is not None:
-                verdict = replace(verdict, budget=replace(verdict.budget, drift=drift))
-                factors = tuple(self.combine(step, readings, verdict.budget))
+        budget = self._with_drift(verdict.budget, step, readings, factors)
+        if budget is not verdict.budget:
+            verdict = replace(verdict, budget=budget)
+            factors = tuple(self.combine(step, readings, budget))
         if self._lift.carried:
             return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)
         if factors[0].source == "unknown":
             self.rejections["motion.silent"] += 1
         return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
+
+    def _with_drift(
+        self, budget: NoiseBudget, step: Step, readings: MotionReadings, factors: Sequence[MotionMeasurement]
+    ) -> NoiseBudget:
+        """The budget with the noise by which dead reckoning was further off between fixes than it says, if it was."""
+        if self._drifts is None:
+            return budget
+        of_all, of_model = self._drifts
+        carried, witnessed = self._lift.carried, self.sources.is_witnessed(readings)
+        of_all.advance(step, () if carried or witnessed or factors[0].source == "unknown" else factors)
+        of_model.advance(step, () if carried or readings.learned is None else (readings.learned,))
+        density = of_model.density if witnessed else of_all.density
+        if density is None or carried:
+            return budget
+        return replace(budget, learned_drift=density) if witnessed else replace(budget, drift=density)
 
     def _judge_beside(
         self, step: Step, readings: MotionReadings, verdict: FaultVerdict
@@ -816,8 +836,8 @@ class MotionJudge:
         """Update bias and drift of the sources after a step, see `MotionSources.commit`."""
         if fix is not None:
             self.record_fix()
-            if self._unseen is not None:
-                self._unseen.fix(fix)
+            for drift in self._drifts or ():
+                drift.fix(fix)
         self.sources.commit(motion.readings, fix, observes_yaw)
 
     def record_fix(self) -> None:

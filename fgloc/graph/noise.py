@@ -154,12 +154,14 @@ class NoiseBudget:
         overruled_cov: ``(3, 3)`` added to each factor, as sightings found the motion wrong; None: they did not.
         drift: densities ``(3,)`` [m²/s, m²/s, rad²/s] that are added to the motion of a robot that moves, as dead
             reckoning was further off between fixes than its covariance says; None: it was not.
+        learned_drift: likewise, of the learned motion by itself.
     """
 
     rejected: Mapping[str, str] = field(default_factory=dict)
     scale: float = 1.0
     overruled_cov: FloatArray | None = None
     drift: FloatArray | None = None
+    learned_drift: FloatArray | None = None
 
     @property
     def scales(self) -> dict[str, float]:
@@ -192,6 +194,8 @@ class NoiseBudget:
         if wheels is not None:
             wheels = _scaled(wheels, scales.get("wheels", 1.0))
         learned = None if learned is None or "learned" in self.rejected else _scaled(learned, scales["learned"])
+        if learned is not None and self.learned_drift is not None:
+            learned = drifting(learned, self.learned_drift)
         if gyro is None or "gyro" in self.rejected or (learned is not None and rules.learned_has_gyro):
             gyro = None
         beside = [m for m in readings.beside if m.source not in self.rejected]

@@ -83,6 +83,14 @@ def test_noise_of_drift_grows_with_the_time_and_with_nothing_at_rest():
         assert np.diag(still.cov).max() < 1e-8
 
 
+def test_noise_of_the_models_drift_is_the_models_alone():
+    budget, moved = NoiseBudget(learned_drift=np.array([1.0, 1.0, 2.0])), np.array([0.1, 0.0, 0.0])
+    wheels, learned = (MotionMeasurement(name, 0, 2 * 10**8, moved, 1e-6 * np.eye(3)) for name in ("wheels", "learned"))
+    as_wheels, as_learned = budget.combine(MotionReadings(wheels, learned), FusionRules())
+    assert as_wheels.cov == pytest.approx(wheels.cov)
+    assert np.diag(as_learned.cov) == pytest.approx([0.2, 0.2, 0.4], rel=1e-3)
+
+
 def test_a_saved_state_without_the_gains_of_a_model_is_resumed(tmp_path):
     saved = State(names=("wheels.radius", "learned.scale"), mean=(0.01, 0.02), cov=((1e-6, 0.0), (0.0, 1e-6)))
     here = Installation({"wheels.radius": 0.02, "learned.turn_scale": 0.03})
