@@ -730,8 +730,8 @@ class MotionJudge:
             self.sources.beside = OdometriesBeside(config.weights, sensors.beside, estimator.factors, by_sightings)
         self._lift = LiftMonitor(config.estimator.lag_s, None if sensors.gyro is None else sensors.gyro.up)
         # Of all motion sources together, where none shows the errors of another; and of the learned motion by itself
-        flat = config.weights.adaptive and not estimator.installation.ground
-        self._drifts = (UnseenDrift(estimator), UnseenDrift(estimator)) if flat else None
+        told = config.weights.adaptive and estimator.factors.known and not estimator.installation.ground
+        self._drifts = (UnseenDrift(estimator), UnseenDrift(estimator)) if told else None
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
     def begin_segment(self, step: Step) -> None:

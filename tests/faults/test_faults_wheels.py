@@ -135,7 +135,7 @@ def test_a_known_failure_is_left_out_from_the_start(tmp_path, witness):
     error, sigma = position_error(at_end, world.truth(at_end.stamp_ns)), math.sqrt(np.trace(at_end.cov[:2, :2]))
     assert error < 3.0 * sigma
     assert (error < 0.1) == (witness == "learned")  # without a witness nobody knows the way, and it says so
-    assert (sigma < 0.2) == (witness == "learned")
+    assert (sigma < 0.25) == (witness == "learned")
     assert not any("disagreed" in note for note in made.localizer.notes)  # nothing that was not known
 
 

@@ -21,7 +21,7 @@ EXACT = {
     },
     "landmarks": {"range_scale_sigma": 0.0, "bearing_bias_sigma_rad": 0.0, "time_offset_sigma_s": 0.0},
     "map": {"position_sigma_m": 0.0, "rotation_sigma_rad": 0.0},
-    "motion": {"scale_sigma": 0.0},
+    "motion": {"scale_sigma": 0.0, "adaptation_sigma": 0.0},
 }
 
 
