@@ -38,8 +38,9 @@ from typing import Any
 import numpy as np
 import torch
 
+import fgloc_training
+from benchmarks import drives
 from benchmarks.common import Row, main
-from benchmarks.drives import load_made
 from benchmarks.recordings import SEEDS, Recorded, Split, Take, cache_folder, changed, load, scenario
 from benchmarks.replays import failure, failures, kept, parallel, replayed
 from benchmarks.scores import errors
@@ -161,7 +162,7 @@ def _run_group(cells: Sequence[Cell]) -> dict[Cell, dict[str, Any]]:
 
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Errors of one run online."""
-    recorded = load_made(_made(cell.change, True)[0], cell.seed, f"learning/{cell.change}")
+    recorded = drives.load_made(_made(cell.change, True)[0], cell.seed, f"learning/{cell.change}")
     recorded = replace(recorded, events=tuple(e for e in recorded.events if not isinstance(e, SENSORS[cell.sensors])))
     settings: dict[str, Any] = {
         "motion": {"model": model(cell.change if cell.way == "native" else "base"), "use": True}
@@ -223,7 +224,14 @@ def _made(change: str, test: bool) -> tuple[Scenario, str]:
     installation = Installation.as_installed() if test else None
     update = {"name": change, "robot": robot, "world": world, "duration_s": _DURATION_S, "installation": installation}
     made = made.model_copy(update=update)
-    return made, hashlib.sha256(describe(made, 0, test).encode()).hexdigest()[:12]
+    return made, hashlib.sha256(describe(made, 0, test).encode() + _sources()).hexdigest()[:12]
+
+
+@cache
+def _sources() -> bytes:
+    """Code on which models and cells depend, beside that of `benchmarks.replays.kept`."""
+    paths = [Path(__file__), Path(drives.__file__), *sorted(Path(fgloc_training.__file__).parent.glob("*.py"))]
+    return b"".join(path.read_bytes() for path in paths)
 
 
 @cache

@@ -601,22 +601,23 @@ def _without(readings: MotionReadings, sources: Collection[str]) -> MotionReadin
     return replace(readings, **gone, beside=beside)
 
 
-# --- Drift that no other source shows ---
+# --- Drift between fixes ----------------------------------------------------------------------------------------------
 
 _STRETCH_S = 2.0  # between two fixes that are compared: about as long as errors of slips and of models last
 _LONGEST_S = 10.0  # without a fix; a longer stretch is not compared
 _CALM_S = 30.0  # of driving without any excess that are counted before the run
 _REMEMBERED_S = 600.0  # of driving, after which floor and load may be others
 _VAGUE = 0.25  # m², rad²: a stretch that is expected to be off by more says nothing
-_MOST = 0.5  # of the way and of the turn, by which dead reckoning may be off; more is a wrong place
+_MOST = 0.5  # of the way and of the turn, by which dead reckoning may be off; more is a wrong place ...
+_ANYWAY = 0.15  # m, rad: ... so much aside
 
 
-class UnseenDrift:
-    """What dead reckoning was off by between fixes, beyond its covariance, where no source shows errors of another.
+class ExcessDrift:
+    """Drift of dead reckoning between fixes, as far as it exceeds its covariance: it is expected to go on, as noise.
 
-    Wheels alone do not show that they slip, and a model of commands not that it is of another floor. Sightings do: over
-    stretches of `_STRETCH_S` from one fix to another the squared error of dead reckoning, less what its covariance
-    expects, is summed over the run. It is to be expected to go on: as noise of that density.
+    Wheels alone do not show that they slip, and a model of commands does not show that it is of another floor.
+    Sightings do. From one fix to another, `_STRETCH_S` and more later, the squared error of dead reckoning less the
+    variance that it expects is added to a sum, which forgets within `_REMEMBERED_S`.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -663,7 +664,7 @@ class UnseenDrift:
             return
         if self._belief is not None and self._moving_s > 0.0:
             x, y, yaw = se2.between(self._belief.pose, belief.pose)
-            most = _MOST * np.array([self._way, self._turn]) + (_LEAST_M, _LEAST_M)
+            most = _MOST * np.array([self._way, self._turn]) + _ANYWAY
             error = np.minimum([math.hypot(x, y), abs(yaw)], most) ** 2
             P = self._belief.cov + belief.cov
             expected = np.array([P[0, 0] + P[1, 1], P[2, 2]])
@@ -729,9 +730,9 @@ class MotionJudge:
         if sensors.beside:
             self.sources.beside = OdometriesBeside(config.weights, sensors.beside, estimator.factors, by_sightings)
         self._lift = LiftMonitor(config.estimator.lag_s, None if sensors.gyro is None else sensors.gyro.up)
-        # Of all motion sources together, where none shows the errors of another; and of the learned motion by itself
+        # Of all motion sources together, where none shows the errors of another; else of the learned motion by itself
         told = config.weights.adaptive and estimator.factors.known and not estimator.installation.ground
-        self._drifts = (UnseenDrift(estimator), UnseenDrift(estimator)) if told else None
+        self._drifts = (ExcessDrift(estimator), ExcessDrift(estimator)) if told else None
         self._signs: list[Decision] = []  # of a lift, in the newest step
 
     def begin_segment(self, step: Step) -> None:
@@ -799,12 +800,15 @@ class MotionJudge:
         """The budget with the noise by which dead reckoning was further off between fixes than it says, if it was."""
         if self._drifts is None:
             return budget
-        of_all, of_model = self._drifts
-        carried, witnessed = self._lift.carried, self.sources.is_witnessed(readings)
-        of_all.advance(step, () if carried or witnessed or factors[0].source == "unknown" else factors)
-        of_model.advance(step, () if carried or readings.learned is None else (readings.learned,))
-        density = of_model.density if witnessed else of_all.density
-        if density is None or carried:
+        witnessed = self.sources.is_witnessed(readings)
+        idle, drift = self._drifts if witnessed else self._drifts[::-1]
+        idle.forget_fix()
+        known = factors if factors[0].source != "unknown" else ()
+        if witnessed:
+            known = () if readings.learned is None else (readings.learned,)
+        drift.advance(step, () if self._lift.carried else known)
+        density = drift.density
+        if density is None or self._lift.carried:
             return budget
         return replace(budget, learned_drift=density) if witnessed else replace(budget, drift=density)
 

@@ -195,7 +195,7 @@ class NoiseBudget:
             wheels = _scaled(wheels, scales.get("wheels", 1.0))
         learned = None if learned is None or "learned" in self.rejected else _scaled(learned, scales["learned"])
         if learned is not None and self.learned_drift is not None:
-            learned = drifting(learned, self.learned_drift)
+            learned = _drifting(learned, self.learned_drift)
         if gyro is None or "gyro" in self.rejected or (learned is not None and rules.learned_has_gyro):
             gyro = None
         beside = [m for m in readings.beside if m.source not in self.rejected]
@@ -208,7 +208,7 @@ class NoiseBudget:
                 learned = rules.joint.decorrelate(wheels, learned)
         known = [m for m in (wheels, learned, *beside) if m is not None]
         if self.drift is not None:
-            known = [drifting(m, len(known) * self.drift) for m in known]
+            known = [_drifting(m, len(known) * self.drift) for m in known]
         if gyro is not None and known:
             if rules.turns_by_gyro:
                 known = [replace(m, cov=m.cov + np.diag([0.0, 0.0, se2.ANY_YAW * (m not in beside)])) for m in known]
@@ -240,7 +240,7 @@ def moves(motion: FloatArray, seconds: float) -> bool:
     return bool(math.hypot(*motion[:2]) + abs(float(motion[2])) > _STANDS * seconds)
 
 
-def drifting(m: MotionMeasurement, density: FloatArray) -> MotionMeasurement:
+def _drifting(m: MotionMeasurement, density: FloatArray) -> MotionMeasurement:
     """The motion with noise of these densities ``(3,)``, if it is one."""
     seconds = (m.stamp_ns - m.start_ns) * 1e-9
     return replace(m, cov=m.cov + np.diag(density * seconds)) if moves(m.motion, seconds) else m

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from typing import Any
 
 import numpy as np
 
-from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import rotation_of
 from fgloc.sensors import registry
@@ -21,7 +21,7 @@ from fgloc.sensors.learned.network import JointCalibration
 from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc.sensors.measurements import LandmarkMeasurement, LandmarkSighting
 from fgloc.sensors.odometry import BesideOdometry
-from fgloc.sensors.wheels.motion import HALF_NS, WheelMotion
+from fgloc.sensors.wheels.motion import WheelMotion, mean_twist
 from fgloc.types import (
     Camera,
     FloatArray,
@@ -234,8 +234,7 @@ class MotionCompensation:
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Twist ``(3,)`` of the base [m/s, m/s, rad/s] at a time near the step's end."""
-        motion, _ = self._moved(step, at_ns - HALF_NS, at_ns + HALF_NS)
-        twist = np.asarray(se2.log(motion) / (2e-9 * HALF_NS))
+        twist = mean_twist(partial(self._moved, step), at_ns)
         if self._gyro is not None and step.inertial:
             twist[2] = self._gyro.rates_at(step.inertial, (at_ns,))[0]
         return twist

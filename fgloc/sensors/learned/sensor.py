@@ -184,7 +184,7 @@ def _check(tensors: Tensors, card: ModelCard, path: Path) -> None:
 
 
 GAINS = ("scale", "turn_scale", "yaw_per_m")
-"""What this robot does otherwise than the one that the model is of: settings, and parameters of the installation."""
+"""Gains by which a robot differs from its model: settings, and parameters of the installation."""
 _AS_ITS_MODEL = (1.0, 1.0, 0.0)
 _GATE_SIGMA = 0.05  # share, rad/m: floor, load and battery change a robot by more than its prior, not by six of it
 
@@ -328,21 +328,22 @@ class LearnedMotion:
         m = self.measure(step, gyro_bias)
         if m is None:
             return None
-        ahead, left, turn, pulled = self._moved(m.motion)
+        scale, turn_scale, _ = self._gains
+        ahead, left, turn = se2.log(m.motion).tolist()
         by = {
-            "learned.scale": np.array([ahead, left, 0.0]),
-            "learned.turn_scale": np.array([0.0, 0.0, turn]),
-            "learned.yaw_per_m": np.array([0.0, 0.0, float(se2.log(m.motion)[0])]),
+            "learned.scale": np.array([scale * ahead, scale * left, 0.0]),
+            "learned.turn_scale": np.array([0.0, 0.0, turn_scale * turn]),
+            "learned.yaw_per_m": np.array([0.0, 0.0, ahead]),
         }
-        if self._gains != _AS_ITS_MODEL:
-            m = replace(m, motion=se2.exp(np.array([ahead, left, turn + pulled])))
-        return m, by
+        return replace(m, motion=self._adapted(m.motion)), by
 
-    def _moved(self, motion: FloatArray) -> tuple[float, float, float, float]:
-        """Logarithm of a motion of the model for this robot: way, way to the left, turn, and turn by being pulled."""
+    def _adapted(self, motion: FloatArray) -> FloatArray:
+        """Motion ``(3,)`` of this robot where the model's is ``motion``."""
+        if self._gains == _AS_ITS_MODEL:
+            return motion
         scale, turn_scale, yaw_per_m = self._gains
         ahead, left, turn = se2.log(motion).tolist()
-        return scale * ahead, scale * left, turn_scale * turn, yaw_per_m * ahead
+        return se2.exp(np.array([scale * ahead, scale * left, turn_scale * turn + yaw_per_m * ahead]))
 
     def motion_between(self, step: Step, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """Motion ``(3,)`` and covariance ``(3, 3)`` from one time to another near the step's end, which may be earlier.
@@ -356,8 +357,7 @@ class LearnedMotion:
         found = self.model.predict(step.controls, min(start_ns, end_ns), max(start_ns, end_ns), None)
         if found is None:
             return None
-        ahead, left, turn, pulled = self._moved(found.motion)
-        motion = se2.exp(np.array([ahead, left, turn + pulled]))
+        motion = self._adapted(found.motion)
         if start_ns < end_ns:
             return motion, found.cov
         ad = se2.adjoint(motion)

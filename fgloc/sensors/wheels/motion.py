@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Collection, Container, Iterator
+from collections.abc import Callable, Collection, Container, Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -203,8 +204,19 @@ _TRACKS: dict[str, type[Track]] = {
     "command": CommandTrack,
 }
 
-HALF_NS = 20_000_000
+_HALF_NS = 20_000_000
 _SHORTEST_TOLD_S = 1e-3  # without a known motion, in all; less is counted, but no note
+
+
+def mean_twist(between: Callable[[int, int], tuple[FloatArray, FloatArray]], at_ns: int) -> FloatArray:
+    """Twist ``(3,)`` of the base [m/s, m/s, rad/s]: the mean over 40 ms around a time.
+
+    Args:
+        between: gives the motion ``(3,)`` from one time [ns] to another, with its covariance.
+        at_ns: the time.
+    """
+    motion, _ = between(at_ns - _HALF_NS, at_ns + _HALF_NS)
+    return np.asarray(se2.log(motion) / (2e-9 * _HALF_NS))
 
 
 class WheelMotion:
@@ -339,8 +351,7 @@ class WheelMotion:
 
     def twist(self, step: Step, at_ns: int) -> FloatArray:
         """Twist ``(3,)`` of the base [m/s, m/s, rad/s] at a time near the step's end: the mean over 40 ms around it."""
-        motion, _ = self.motion_between(step, at_ns - HALF_NS, at_ns + HALF_NS)
-        return np.asarray(se2.log(motion) / (2e-9 * HALF_NS))
+        return mean_twist(partial(self.motion_between, step), at_ns)
 
     def derivatives(
         self,
