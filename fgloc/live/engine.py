@@ -203,6 +203,8 @@ _MOST_EVENTS = 20_000  # that wait for the estimator: 30 s of a busy robot
 _MEAN_OF = 20  # steps, in the mean of their time
 _SAVE_EVERY_S = 1.0
 _COMPARE_EVERY_S = 0.5  # or less often, where nothing new is to be compared
+_COMPARED_SHARE = 0.03  # of the time, that comparisons may compute: on a slow computer they come less often ...
+_COMPARED_FREELY_S = 1.0  # ... beyond so much: what is wrong from the start is named as soon as it shows
 _UNFOUND = (State.WAITING, State.DETECTING)
 
 
@@ -528,7 +530,9 @@ class Estimation:
 
     def _compare_regularly(self) -> None:
         """Compare signals beside the estimation, which goes on meanwhile, also where this fails."""
-        while self._pause(_COMPARE_EVERY_S):
+        began, free_s = time.monotonic(), _COMPARED_FREELY_S
+        while self._pause(max(_COMPARE_EVERY_S, -free_s / _COMPARED_SHARE)):
+            computed = time.thread_time()
             with self._busy:
                 comparison = self.run.comparison()
             try:
@@ -538,6 +542,10 @@ class Estimation:
                 with self._changed:
                     self._notes.setdefault(f"sensors are not compared any more: {unexpected(error, 'the comparison')}")
                 return
+            now = time.monotonic()
+            free_s += (now - began) * _COMPARED_SHARE - (time.thread_time() - computed)
+            free_s = min(free_s, _COMPARED_FREELY_S)
+            began = now
 
     def _save_regularly(self) -> None:
         while self._pause(_SAVE_EVERY_S):

@@ -342,6 +342,7 @@ class Messages:
         ``ros1``: `to_cdr` is given messages in ROS 1 serialization.
         """
         self._store = default_typestore() if store is None else store
+        self._fields: dict[str, dict[str, tuple[FieldLayout, Any]]] = {}  # with their zeros, by type
         self._ros1 = ros1
 
     @classmethod
@@ -412,25 +413,34 @@ class Messages:
         return bytes(self._store.ros1_to_cdr(raw, message_type)) if self._ros1 else raw
 
     def _build(self, message_type: str, values: Mapping[str, Any]) -> Any:
-        fields = [_field(name, description) for name, description in self._store.fielddefs[message_type][1]]
-        if unknown := values.keys() - {field.name for field in fields}:
+        fields = self._fields.get(message_type)
+        if fields is None:
+            described = [_field(name, description) for name, description in self._store.fielddefs[message_type][1]]
+            fields = self._fields[message_type] = {field.name: (field, _zero(field)) for field in described}
+        if unknown := values.keys() - fields.keys():
             raise KeyError(f"{message_type} has no {', '.join(sorted(unknown))}")
-        return self._store.types[message_type](**{field.name: self._value(field, values) for field in fields})
+        content = {name: self._value(field, zero, values.get(name)) for name, (field, zero) in fields.items()}
+        return self._store.types[message_type](**content)
 
-    def _value(self, field: FieldLayout, values: Mapping[str, Any]) -> Any:
-        given = values.get(field.name)
+    def _value(self, field: FieldLayout, zero: Any, given: Any) -> Any:
         if field.array is None and field.sequence is None:
             if field.nested:
                 return self._build(field.element, given or {})
-            if given is not None:
-                return given
-            return "" if field.element == "string" else np.zeros(1, _dtype(field.element))[0].item()
-        items: Sequence[Any] = given if given is not None else ()
+            return zero if given is None else given
         if field.nested:
-            return [self._build(field.element, item) for item in items]
+            return [self._build(field.element, item) for item in (() if given is None else given)]
         if field.element == "string":
-            return list(items)
-        return np.asarray(items if given is not None else np.zeros(field.array or 0), dtype=_dtype(field.element))
+            return list(() if given is None else given)
+        return zero.copy() if given is None else np.asarray(given, dtype=zero.dtype)
+
+
+def _zero(field: FieldLayout) -> Any:
+    """Value of a field that is not given."""
+    if field.nested or field.element == "string":
+        return ""
+    if field.array is not None or field.sequence is not None:
+        return np.zeros(field.array or 0, _dtype(field.element))
+    return np.zeros(1, _dtype(field.element))[0].item()
 
 
 def ros2_type(message_type: str) -> str:
