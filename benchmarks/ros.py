@@ -14,7 +14,8 @@ Source ROS's setup first; where rclpy is missing, the rows say so. A player in r
 - ``ros.lifecycle_*``: random transitions and kills while a recording is played: processes that ended or transitions
   that did what they should not, children that stayed after a kill, memory gained since the fifth unconfigured state.
 - ``ros.cli_wrong``: commands of ROS (``ros2 topic``, ``param``, ``lifecycle``, ...; tf2), asked of the node and of
-  ``fgloc live``, that did not answer, or warned.
+  ``fgloc live``, that did not answer, or warned, also when asked again; ``ros.cli_again``: share that was
+  asked again; ``ros.cli_bare_again``: of such commands about a bare node in rclpy, as ROS does not find all at once.
 - ``ros.load``: processes that ran or wanted to, mean over a minute: more than the machine's cores disturb the rates.
 """
 
@@ -42,6 +43,7 @@ _SETTLED = 5  # unconfigured states before which memory is not counted: librarie
 _IDS = (
     *("ros.equal_mm", "ros.equal_keyframes", "ros.two_robots", "ros.two_robots_keyframes"),
     *("ros.lifecycle_crashes", "ros.lifecycle_orphans", "ros.lifecycle_mb", "ros.cli_wrong", "ros.load"),
+    *("ros.cli_again", "ros.cli_bare_again"),
     *(f"ros.{fast}{name}" for fast in ("", "fast_") for name in ("rate_hz", "latency_ms_p50", "latency_ms_p99")),
     *(f"ros.{fast}{name}cpu_share" for fast in ("", "fast_") for name in ("", "relay_")),
 )
@@ -190,7 +192,7 @@ def lifecycle(kinds: Sequence[str], count: int) -> Iterator[Row]:
 
 def cli(kinds: Sequence[str]) -> Iterator[Row]:
     """Row of the commands of ROS."""
-    sample, wrong, asked = SAMPLES / _NAMES[0], 0, 0
+    sample, asked = SAMPLES / _NAMES[0], []
     for kind in kinds:
         for participant in (False, True):
             for one in ask(
@@ -199,11 +201,14 @@ def cli(kinds: Sequence[str]) -> Iterator[Row]:
                 parameters=parameters(sample),
                 participant=participant,
             ):
-                asked += 1
-                wrong += bool(one["wrong"])
-                if one["wrong"]:
+                asked.append(one)
+                if one["first_wrong"]:
                     print(f"{kind} {'live' if participant else 'node'}: {one}", file=sys.stderr)
-    yield Row("ros.cli_wrong", wrong, n=asked)
+    own, bare = ([one for one in asked if one["bare"] is is_bare] for is_bare in (False, True))
+    yield Row("ros.cli_wrong", sum(bool(one["wrong"]) for one in own), n=len(own))
+    for name, group in (("", own), ("bare_", bare)):
+        again = [one for one in group if one["first_wrong"]]
+        yield Row(f"ros.cli_{name}again", len(again) / len(group), n=len(group))
 
 
 if __name__ == "__main__":

@@ -742,7 +742,10 @@ def restamped(content: bytes, later_ns: int) -> bytes:
 
 
 def commands(bag: str, parameters: Mapping[str, Any], participant: bool) -> list[dict[str, Any]]:
-    """Commands of ROS while the node, or ``fgloc live``, localizes: what each ended with and what it said."""
+    """Commands of ROS while the node, or ``fgloc live``, localizes: what each ended with and what it said.
+
+    One that is wrong is asked again. Some are of a bare node in rclpy (``bare``): what is wrong with it too is ROS's.
+    """
     ros2 = shutil.which("ros2") or "ros2"
     asked: list[dict[str, Any]] = []
     files = {key: str(parameters[key]) for key in ("config", "map")}
@@ -758,11 +761,14 @@ def commands(bag: str, parameters: Mapping[str, Any], participant: bool) -> list
         playing.start()
         try:
             wait_until(lambda: heard, PATIENCE_S)
-            every = [ros2, "topic", "list"]  # until the daemon that it starts has found them
+            subprocess.run([ros2, "daemon", "start"], capture_output=True, check=False)
+            every = [ros2, "topic", "list"]  # until the daemon has found them
             wait_until(lambda: "/fgloc/map" in subprocess.run(every, capture_output=True, text=True).stdout, PATIENCE_S)
-            for command, expected, seconds in _TOPIC_COMMANDS + (() if participant else _NODE_COMMANDS):
-                asked.append(_asked([ros2, *command.split()], expected, seconds))
-            asked.append(_asked([*command_of("transform")], "map -> odom", 0.0))
+            own = _TOPIC_COMMANDS + (() if participant else _NODE_COMMANDS)
+            for bare, group in ((False, own), (True, _BARE_COMMANDS)):
+                for command, expected, seconds in group:
+                    asked.append(_asked_twice([ros2, *command.split()], expected, seconds) | {"bare": bare})
+            asked.append(_asked_twice([*command_of("transform")], "map -> odom", 0.0) | {"bare": False})
         finally:
             stop.set()
             playing.join()
@@ -810,7 +816,23 @@ _NODE_COMMANDS: tuple[tuple[str, str, float], ...] = (
     ("lifecycle set /fgloc deactivate", "Transitioning successful", 0.0),
     ("lifecycle set /fgloc activate", "Transitioning successful", 0.0),
 )
+_BARE_COMMANDS: tuple[tuple[str, str, float], ...] = (
+    ("topic info -v /odom", "type hash: RIHS01_", 0.0),
+    ("topic hz /odom", "average rate: ", 8.0),
+    ("topic hz /odom", "average rate: ", 8.0),
+    ("topic echo --once /odom", "frame_id: ", 0.0),
+    ("topic echo --once --filter True /odom", "frame_id: ", 0.0),
+    ("node info /peer", "/odom: nav_msgs/msg/Odometry", 0.0),
+    ("param list /peer", "use_sim_time", 0.0),
+    ("param describe /peer use_sim_time", "Parameter name: use_sim_time", 0.0),
+)
 _WARNING = re.compile(r"warn|error|fail|traceback|invalid", re.IGNORECASE)
+
+
+def _asked_twice(command: Sequence[str], expected: str, seconds: float) -> dict[str, Any]:
+    """Answer of a command, asked again if it is wrong; what was wrong with the first one is ``first_wrong``."""
+    first = _asked(command, expected, seconds)
+    return (_asked(command, expected, seconds) if first["wrong"] else first) | {"first_wrong": first["wrong"]}
 
 
 def _asked(command: Sequence[str], expected: str, seconds: float) -> dict[str, Any]:

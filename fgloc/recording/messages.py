@@ -7,7 +7,7 @@ parses IDL by trying: two nested parentheses take a minute. So a definition is c
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
