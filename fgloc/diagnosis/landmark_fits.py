@@ -36,7 +36,7 @@ from fgloc.types import FloatArray, IntArray
 _LAG_STEP_S = 0.05
 _NUDGE_S = 1e-3
 _PAIR_S = (0.4, 6.0)  # between two sightings of one landmark: the wheels err little over seconds
-_MOST_PAIRS = 1000  # for the start of a fit
+_MOST_PAIRS = 4000
 _FEWEST_TRACKS = 5  # landmarks times _TRACK_S: the errors of one track are alike, and fewer are no sample
 _MOST_LOG_SCALE = 10.0  # beyond any unit of length
 _GAINS = 2.5  # standard deviations of the gain from track to track: noise of the wheels gains up to 2.4
