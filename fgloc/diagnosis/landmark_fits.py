@@ -463,15 +463,15 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
         return None
     misfit, mirrored, shift, scales = best
     scale = float(np.median(scales))
-    # landmarks are off on the map all the time, so that only other landmarks are another sample
-    ids = np.unique(np.concatenate([list(window) for window in windows]))
+    # landmarks are off on the map all the time, so that only other landmarks are another sample; of three there is none
+    ids = np.array(sorted({i for window in windows for i in window if i + shift in places}))
     left_out = []
     for b in range(min(BLOCKS, len(ids))):
         kept = [{i: q for i, q in w.items() if i not in ids[b::BLOCKS]} for w in windows]
         part, _ = _laid_on(kept, places, shift, mirrored)
         if len(part) >= _FEWEST_WINDOWS:
             left_out.append([float(np.median(part))])
-    sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else math.inf
+    sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else scale * misfit
     return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit, len(scales))
 
 

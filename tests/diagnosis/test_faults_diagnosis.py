@@ -255,6 +255,25 @@ def test_fault_52_a_contradiction_that_nothing_explains_is_said_too():
     assert alone(diagnose(events(world), LandmarkMap(mixed)), "map.contradiction").severity is Severity.ERROR
 
 
+@pytest.mark.parametrize(("known", "seed"), [(3, 6), (3, 7), (3, 9), (4, 20), (4, 23)])
+def test_a_map_of_another_place_is_in_no_unit_though_few_of_its_ids_are_seen(known, seed):
+    world, rng = beacons(), np.random.default_rng(seed)
+    elsewhere = {
+        i: dataclasses.replace(world.landmarks[i], position=np.append(rng.uniform(0.0, 12.0, 2), 0.0))
+        for i in rng.choice(list(world.landmarks), known, replace=False).tolist()
+    }
+    found = diagnose(events(world), LandmarkMap(elsewhere))
+    assert not found.keys() & {"map.unit", "wheels.scale", "scales"}
+
+
+@pytest.mark.parametrize("known", [3, 4])
+def test_a_map_of_few_landmarks_in_feet_is_named(known):
+    world = beacons()
+    few = list(world.landmarks.items())[:known]
+    wrong = {i: dataclasses.replace(lm, position=lm.position * 3.28) for i, lm in few}
+    assert "map.unit" in diagnose(events(world), LandmarkMap(wrong))
+
+
 def test_fault_52_all_map_poses_shifted_against_the_given_first_pose():
     world = beacons()
     shifted = {
