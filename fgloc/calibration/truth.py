@@ -269,8 +269,6 @@ class _Fit:
                 self.config, self._off, self._body, self._late_s = before
                 damping = max(30.0 * damping, 1e-6)
             if not improved or cost - now < _CONVERGED * max(1.0, cost):
-                if not improved:
-                    self._rows()
                 return
             cost = now
 

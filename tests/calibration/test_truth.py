@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from fgloc import cli, se2
 from fgloc.calibrate import calibrate
+from fgloc.calibration.truth import calibrate_by_truth
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
@@ -56,6 +57,51 @@ def write_tricycle(folder, seconds=80.0, truth=True):
             pose = se2.compose(pose, se2.exp(twist * 0.01 + noise))
             travel += rate * 0.01
     return folder / "bag"
+
+
+GAINS = Config.model_validate({"truth": {"align": "se2"}})
+
+
+def write_odometry(folder, told=lambda k: True, n=409):
+    """An odometer that reports too short a way, and a truth of the body, late; as a default just enough of it."""
+    rng = np.random.default_rng(5)
+    pose, reported = np.zeros(3), np.zeros(3)
+    with BagWriter(folder / "bag") as bag:
+        for k in range(n):
+            t, stamp = 0.1 * k, START_NS + k * 100_000_000
+            v, omega = 0.5 + 0.2 * math.sin(0.2 * t), 0.6 * math.sin(0.4 * t) + 0.3 * math.sin(1.1 * t)
+            bag.odometry("/odom", stamp, reported.tolist(), (v / 1.05, omega))
+            x, y, yaw = se2.compose(pose, BODY) + rng.normal(0.0, 0.002, 3)
+            if told(k):
+                turned = (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+                bag.truth("/truth", stamp + round(LATE_S * 1e9), (x, y, 0.0), turned)
+            step = np.array([0.1 * v, 0.0, 0.1 * omega])
+            pose = se2.compose(pose, se2.exp(step + rng.normal(0.0, 0.001, 3)))
+            reported = se2.compose(reported, se2.exp(step / [1.05, 1.0, 1.0]))
+    return folder / "bag"
+
+
+def test_gains_and_noise_of_an_odometer_are_found_with_the_place_and_clock_of_the_body(tmp_path):
+    found, listed = calibrate_by_truth([write_odometry(tmp_path)], GAINS)
+    assert found.wheels.scale_v == pytest.approx(1.05, abs=0.005)
+    assert found.wheels.scale_omega == pytest.approx(1.0, abs=0.01)
+    assert found.truth.offset_m == pytest.approx(BODY[:2], abs=0.01)
+    assert found.truth.yaw_offset_rad == pytest.approx(BODY[2], abs=0.01)
+    assert found.recording.stamp_offset_s["truth"] == pytest.approx(-LATE_S, abs=0.02)
+    assert 0.02 < found.wheels.noise.x_per_sqrt_m / GAINS.wheels.noise.x_per_sqrt_m < 0.3
+    by_name = {s.name: s for s in listed}
+    assert by_name["truth.x"].found == pytest.approx(BODY[0], abs=5.0 * by_name["truth.x"].sigma)
+    assert all(0.0 < s.sigma < 0.5 * s.prior_sigma for s in listed)
+
+
+@pytest.mark.parametrize(
+    ("told", "n"),
+    [(lambda k: k % 16 < 2, 528), (lambda k: not 165 < k < 285, 489)],
+    ids=["pairs", "silent for 12 s"],
+)
+def test_the_truth_ends_no_window_at_a_pose_without_neighbours_and_none_beyond_a_long_silence(tmp_path, told, n):
+    with pytest.raises(EstimatorError, match=r"\b4 s\b"):
+        calibrate_by_truth([write_odometry(tmp_path, told, n)], GAINS)
 
 
 @pytest.mark.slow
