@@ -152,6 +152,18 @@ def test_odometry_in_place_of_the_estimate_has_an_honest_covariance():
     assert 0.02 < np.mean(nees) < 2.0
 
 
+@pytest.mark.parametrize("coordinate", [0, 2], ids=["way", "turn"])
+def test_odometry_is_as_uncertain_as_the_wheels_scales_times_the_way(coordinate):
+    motions = np.zeros((200, 3))
+    motions[1:, coordinate] = 0.1
+    track = dataclasses.replace(
+        track_of(np.zeros((200, 3)), motions, np.random.default_rng(0), ids=()), covs=np.zeros((200, 3, 3))
+    )
+    given = judged(track, estimates(track, np.cumsum(motions, axis=0))).odometry
+    grown = given.covs[-1] - given.covs[0]
+    assert math.sqrt(grown[coordinate, coordinate]) == pytest.approx(0.01 * 19.9, rel=0.01)
+
+
 def watched(poses, given, motions, seen=None, mapped=True):
     """Estimates that a watch returns, one for each step; ``seen``: of each step."""
     watch, out = Watch(mapped, Config()), []

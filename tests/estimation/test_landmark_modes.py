@@ -11,6 +11,7 @@ from exact import exact
 from robot_world import Chain, World, beacons, config, position_error, room
 
 from fgloc import se2
+from fgloc.estimation.landmark_modes import MOVED, rotation_cov
 from fgloc.frames import rpy_matrix
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.range_bearing import RangeBearingEvent
@@ -169,6 +170,11 @@ def test_what_a_displacement_does_to_the_estimate_is_predicted():
     told = modes.sensitivity(3)[:3] @ shift
     assert np.abs(error).max() > 1e-3
     assert told == pytest.approx(error, abs=0.1 * float(np.abs(error).max()))
+
+
+def test_a_marker_that_was_moved_may_have_been_turned_and_hung_higher_but_its_place_is_the_hypothesis():
+    alone = [float(rotation_cov(np.eye(14)[[3 + i]], (1, 6))[0, 0]) for i in range(8)]  # rows of pose, another, marker
+    assert np.array(alone) == pytest.approx([0.0, 0.0, 0.0, MOVED**2, MOVED**2, MOVED**2, MOVED**2, 0.0])
 
 
 def test_of_more_landmarks_than_there_are_hypotheses_those_seen_last_are_followed(monkeypatch):

@@ -98,6 +98,16 @@ def test_revised_motions_are_as_if_they_had_been_given_at_first(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_pose_that_was_set_does_not_follow_motions_revised_before_it(kind):
+    drive, given = Drive(10), PoseWithCovariance(np.array([3.0, 1.0, 0.5]), 1e-4 * np.eye(3))
+    run = estimator(kind)
+    follow(run, drive, range(1, 6), drive.first)
+    run.start(6 * 10**8, given)
+    run.revise({k: drive.later[k] for k in range(3, 6)})
+    assert_same(run.belief, given)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_many_revisions_as_poses_leave_the_window(kind):
     """Slots are used again and poses are marginalized between them; in the end nothing has been swapped for another."""
     drive = Drive(160)

@@ -54,6 +54,8 @@ def test_motions(run):
 
 def test_sightings_and_the_prior_of_the_installation(run):
     frames, factors, poses, theta = run
+    row = np.eye(len(theta))[0]
+    factors.installation.measured(row, 0.5 * factors.installation.sigmas[0], factors.installation.sigmas[0])
     prior = factors.installation.prior()
     one_by_one = [gtsam.PriorFactorVector(INSTALLATION, prior.mean, gtsam.noiseModel.Gaussian.Covariance(prior.cov))]
     for frame, pose in zip(frames, poses, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,16 @@ from fgloc.config import Config, config_of, load_config, yaml_of
 from fgloc.diagnosis.mistakes import find_mistakes, of_camera
 from fgloc.errors import RecordingError
 from fgloc.evaluation.metrics import match_result
+from fgloc.graph.estimators import make_estimator
 from fgloc.live import Live
 from fgloc.recording.reader import open_recording
 from fgloc.replay import RunMode
 from fgloc.runner import RunResult, run
+from fgloc.sensors.equipment import LandmarkSensor, MotionSensors, PoseSensors
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import Finding, LandmarkMap, Severity
 from fgloc_datasets.bag import BagWriter
 
@@ -89,6 +93,13 @@ def test_each_of_two_cameras_has_its_place_its_calibration_and_its_rows(tmp_path
     one = ran(bag, config_of(SECTIONS | {"cameras": {"front": {"sightings": "/front/tags"}}}))
     assert np.median(np.linalg.det(result.trajectory.covs)) < np.median(np.linalg.det(one.trajectory.covs))
     assert worst_mm(result) < 30.0
+
+
+def test_the_estimator_has_the_constants_of_each_camera():
+    sensor = LandmarkSensor(both(), room(), [replace(CAMERA, name=name) for name in SIDES], None)
+    motion = MotionSensors(WheelMotion(both().wheels))
+    made = make_estimator(both(), room(), motion, PoseSensors(sensor), keep_all=False)
+    assert {"cameras.front.x_m", "cameras.rear.x_m"} <= set(made.installation.names)
 
 
 def test_the_clock_of_each_camera_is_found_by_itself(tmp_path):
