@@ -12,7 +12,11 @@ import yaml
 
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of, config_of_file
+from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.mistakes import inspect_all
+from fgloc.diagnosis.signals import Path as Odometry
+from fgloc.diagnosis.signals import Signals
+from fgloc.diagnosis.truth import true_body
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.types import Finding, Landmark, LandmarkMap, Severity, ordered
@@ -212,6 +216,20 @@ def test_a_truth_tells_its_tilt_and_a_yaw_that_is_not_its_own(tmp_path):
     assert found["truth.yaw_is_odometry"].severity is Severity.NOTE
     level = {f.code for f in inspect_all(record(tmp_path / "turned", Broken(turn=0.5)), None, Config()).found}
     assert not level & {"truth.tilt", "truth.yaw_is_odometry"}
+
+
+@pytest.mark.parametrize(("rate", "is_named"), [(0.3, True), (0.01, False)])
+def test_a_yaw_that_hardly_changes_is_not_said_to_be_the_odometrys(rate, is_named):
+    t = np.arange(0.0, 30.0, 0.1)
+    x, still, yaw = 0.2 * t, np.zeros(len(t)), rate * t
+    quaternion = (still, still, np.sin(0.5 * yaw), np.cos(0.5 * yaw))
+    signals = Signals(
+        truth=list(zip(t, x, still, still, *quaternion, strict=True)),
+        odometry=list(zip(t, x, still, yaw, still + 0.2, still, still + rate, strict=True)),
+    )
+    found = Conventions(Config(), signals)
+    true_body(found, Odometry(t, np.column_stack([x, still, yaw]), np.zeros(len(t), dtype=np.int64), "odometry"))
+    assert ("truth.yaw_is_odometry" in found.codes) == is_named
 
 
 def test_a_truth_tells_how_much_wheels_turn(tmp_path):

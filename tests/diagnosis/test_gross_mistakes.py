@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from fgloc import cli
+from fgloc import cli, se2
 from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.landmarks import first_pose_sentence
 from fgloc.diagnosis.setup import check_fit, mirrored, swapped
-from fgloc.diagnosis.setup_fit import Picture, read_excerpt
+from fgloc.diagnosis.setup_fit import EXTRAS, GRID_S, Motion, Picture, Stretch, read_excerpt
 from fgloc.diagnosis.signals import clock_sentence, other_clocks
 from fgloc.diagnosis.truth import truth_sentence
 from fgloc.evaluation.metrics import compute_metrics
@@ -90,6 +90,15 @@ def test_a_sound_set_up_is_not_accused(name, looked):
     checked = (looked if name == "installed_run" else Looked(SAMPLES / name, stretches=5)).check()
     assert checked.fit is not None
     assert checked.correction is None
+
+
+def test_a_set_up_is_not_judged_by_a_few_sightings(looked):
+    some = [dataclasses.replace(p, seen=p.seen[:4]) for p in looked.excerpt.pictures[0][:4]]
+    few = dataclasses.replace(looked.excerpt, pictures=[some])
+    assert 8 <= sum(len(p.seen) for p in some) < 20
+    checked = looked.check(excerpt=few)
+    assert len(checked.stretches) == 1
+    assert checked.fit is None
 
 
 @pytest.mark.parametrize("factor", [0.95, 0.8])
@@ -181,6 +190,17 @@ def test_fault_19_clocks_of_wheels_and_gyro(looked, kind, role):
         signals = dataclasses.replace(signals, motion=early)
     found = looked.check(excerpt=dataclasses.replace(looked.excerpt, signals=signals)).correction
     assert value(rf"stamp_offset_s: \{{{role}:", found.finding.text) == pytest.approx(0.2, abs=0.03)
+
+
+def test_the_motion_of_wheels_and_gyro_fits_poses_on_a_circle_only_if_they_are_those():
+    step, times = np.array([0.02, 0.0, 0.03]), np.array([0.5, 1.5, 3.0, 3.6])
+    stretch = Stretch(times, (), np.tile(step, (200, 1)), np.full(200, 0.03), START_NS)
+    motion, extras = Motion([stretch], np.eye(3), Config()), np.zeros(len(EXTRAS))
+    poses = np.array([se2.exp(step * t / GRID_S) for t in times])
+    np.testing.assert_allclose(se2.between_array(poses, motion.path(0, extras)), 0.0, atol=1e-4)
+    for there, close in ((poses, True), (poses * [1.0, 1.0, 1.1], False)):
+        residuals = [np.abs(r).max() for r, _, _ in motion.rows(there, extras, 3 * len(times))]
+        assert [r < 0.05 for r in residuals] == [close] * len(residuals)
 
 
 # --- by the messages alone ---
