@@ -380,8 +380,7 @@ class Estimation:
         """Use what is queued, but for images, save the state, and end the threads; see `Live.close`."""
         with self._changed:
             closed, self._closing = self._closing, True
-            self._changed.notify_all()
-        self._worker.stop()
+        self._worker.stop()  # notifies the other threads too
         for thread in self._threads:
             thread.join()
         if self._state is not None and not closed:

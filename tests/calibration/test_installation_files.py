@@ -15,14 +15,16 @@ from fgloc.calibration.installation import (
     contradicted,
     contradiction_findings,
     contradictions,
+    found_values,
     settings_found,
     with_settings,
 )
 from fgloc.config import Config, config_of, load_config, yaml_of
 from fgloc.graph.contradictions import Contradiction, Rival
+from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.sensors.cameras import corrected
 from fgloc.sensors.maps import load_map
-from fgloc.types import Camera, Finding, InstallationFound, Setting, Severity
+from fgloc.types import Camera, Finding, InstallationFound, Landmark, LandmarkMap, Setting, Severity
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "installed_run"
 
@@ -76,6 +78,19 @@ def test_settings_are_those_that_undo_the_deviation(tmp_path):
     assert after.landmarks.range_scale == pytest.approx(np.exp(-0.01))
     assert after.landmarks.range_scale_sigma == pytest.approx(0.001)
     assert after.gyro == config.gyro  # not in the state
+
+
+def test_the_range_scale_of_a_run_that_diverged_stays_a_number_of_a_setting():
+    (setting,) = settings_found(found({"sightings.range_scale": (5000.0, 1.0, 0.01)}), Config())
+    assert setting.found < 1e10
+
+
+def test_the_places_of_the_maps_landmarks_are_among_the_values_found():
+    landmark_map = LandmarkMap({7: Landmark(7, np.array([1.0, 2.0, 0.0]), np.eye(3), 0.0)})
+    installation = Installation({"map.7.x_m": 0.05, "map.7.y_m": 0.05})
+    belief = InstallationEstimate(np.array([0.02, -0.03]), np.diag([0.01, 0.02]) ** 2)
+    values = found_values(installation, belief, Config(), (), landmark_map)
+    assert values == {"map.7.x": pytest.approx((1.02, 0.01)), "map.7.y": pytest.approx((1.97, 0.02))}
 
 
 def test_a_camera_is_corrected():

@@ -1,7 +1,10 @@
 """Frame of the map while it is being made: poses that were given stay where they are as well as they can."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from robot_world import START_NS, Chain, World, beacons, config, position_error
 
 from fgloc import se2
 from fgloc.estimation.localizer import MapFrame
@@ -61,3 +64,17 @@ def test_a_long_run_compares_a_bounded_number_of_poses():
     graph.smoothed = lambda k: (asked.append(k), smoothed(k))[1]
     frame.place(2990, smoothed(2990), graph)
     assert 50 < len(asked) < 500
+
+
+def test_after_a_clock_jump_a_map_goes_on_in_its_frame_though_the_robot_drove_meanwhile():
+    world, back_ns = World(beacons(), seed=1, seconds=9.0, rate=5), 10**12
+    events, jump_ns = world.events(), START_NS + 4 * 10**9
+    later = [e for e in events if e.stamp_ns > jump_ns + 1.5e9]
+    later = [replace(e, stamp_ns=e.stamp_ns - back_ns, received_ns=e.received_ns - back_ns) for e in later]
+    chain = Chain(config(estimator={"kind": "isam2"}), None)
+    made = chain.run([*(e for e in events if e.stamp_ns < jump_ns), *later])
+    start = se2.compose(made[0].pose, se2.inverse(world.truth(made[0].stamp_ns)))
+    found = made[-12:]
+    off = [position_error(e, se2.compose(start, world.truth(e.stamp_ns + back_ns))) for e in found]
+    assert all(e.stamp_ns < START_NS for e in found)
+    assert max(off) < 0.09

@@ -361,6 +361,14 @@ def test_a_pose_that_is_told_is_taken_and_sightings_win_over_a_wrong_one():
     assert made[-1].mode is Mode.OK
 
 
+def test_a_pose_that_is_told_is_taken_though_no_message_comes():
+    world = World(beacons(), seconds=1.0)
+    with live_in(world) as live:
+        feed(live, world.events())
+        live.reset_pose((1.0, 2.0, 0.5), (0.1, 0.1, 0.1))
+        assert live.wait(5.0)
+
+
 def test_a_pose_that_is_none_is_refused():
     with Live(config(), beacons()) as live:
         for pose, sigmas in (((0.0, 0.0), (1.0, 1.0, 1.0)), ((0.0, 0.0, np.nan), (1, 1, 1)), ((0, 0, 0), (1, 0, 1))):
