@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from event_makers import odometry
 
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of, config_of_file
 from fgloc.diagnosis.comparison import Conventions
+from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.mistakes import inspect_all
+from fgloc.diagnosis.pairs import Figure
 from fgloc.diagnosis.signals import Path as Odometry
 from fgloc.diagnosis.signals import Signals
-from fgloc.diagnosis.truth import true_body
+from fgloc.diagnosis.truth import BodyFit, check_body, true_body
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.types import Finding, Landmark, LandmarkMap, Severity, ordered
@@ -201,6 +204,20 @@ def test_what_init_writes_undoes_what_is_broken(tmp_path):
     assert not conventions_of(bag, config_of_file(yaml.safe_load(made.text)))
 
 
+@pytest.mark.parametrize(
+    ("late", "codes"),
+    [(lambda t: 0.3, {"clock.imu"}), (lambda t: 0.005 * t, {"clock.drift"})],
+    ids=["late", "drifting"],
+)
+def test_a_clock_that_drifts_is_not_late(late, codes):
+    t, some = TIMES[::10], slice(None, None, 10)
+    signals = Signals(
+        motion=[odometry(s, twist=(v, w)) for s, v, w in zip(t, SPEED[some], RATE[some], strict=True)],
+        imu=[(s + late(s), 0.0, 0.0, w, 0.0, 0.0, 9.81) for s, w in zip(t, RATE[some], strict=True)],
+    )
+    assert conventions(signals, Config()).codes == codes
+
+
 @pytest.mark.slow
 def test_ranges_that_are_said_to_be_depths_and_are_not_are_named(tmp_path):
     bag = record(tmp_path, Broken())
@@ -230,6 +247,14 @@ def test_a_yaw_that_hardly_changes_is_not_said_to_be_the_odometrys(rate, is_name
     found = Conventions(Config(), signals)
     true_body(found, Odometry(t, np.column_stack([x, still, yaw]), np.zeros(len(t), dtype=np.int64), "odometry"))
     assert ("truth.yaw_is_odometry" in found.codes) == is_named
+
+
+@pytest.mark.parametrize(("share", "late", "is_named"), [(0.9, 0.2, True), (0.4, 0.2, False), (0.9, 0.02, False)])
+def test_a_truth_tells_its_clock_only_where_its_yaw_follows_the_wheels(share, late, is_named):
+    as_is, none = Figure(1.0, 0.001), Figure(0.0, 0.001)
+    found = Conventions(Config(), Signals())
+    check_body(found, BodyFit(False, as_is, as_is, none, none, none, Figure(late, 0.001), 0.01, share))
+    assert found.codes == ({"clock.truth"} if is_named else set())
 
 
 def test_a_truth_tells_how_much_wheels_turn(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,13 @@ from real_data import real_data
 from fgloc import run
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file
+from fgloc.diagnosis.comparison import Conventions
+from fgloc.diagnosis.gyro import by_hand
 from fgloc.diagnosis.mistakes import inspect_all
+from fgloc.diagnosis.signals import read_signals
 from fgloc.frames import rpy_matrix
 from fgloc.recording.info import RecordingInfo
+from fgloc.recording.reader import open_recording
 from fgloc.runner import RunResult
 from fgloc_datasets.bag import BagWriter
 
@@ -23,6 +27,9 @@ SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 RADIUS, TRACK, DT = 0.033, 0.16, 0.02
 REST, HELD, LIFTED, SECONDS = 8.0, (26.0, 34.0), (40.0, 46.0), 60.0
+SIDES = {"left_joint": "wheel_left_joint", "right_joint": "wheel_right_joint"} | dict.fromkeys(
+    ("left_radius", "right_radius"), RADIUS
+)
 HANDS = {"motion.held", "motion.lifted"}
 
 
@@ -107,6 +114,19 @@ def test_what_hands_did_is_named_with_its_times_before_a_run(handled) -> None:
     assert found["motion.lifted"] == pytest.approx(LIFTED[0], abs=0.7)
     assert found["imu.gravity_scale"] == pytest.approx(10.25, abs=0.02)
     assert found.keys() == {*HANDS, "imu.gravity_scale", "odometry.yaw_is_gyro"}
+
+
+@pytest.mark.parametrize(("first_s", "last_s", "cut"), [(0.0, SECONDS, True), (22.0, 49.0, False)])
+def test_a_robot_that_would_be_in_hands_for_most_of_a_drive_is_in_none(handled, first_s, last_s, cut) -> None:
+    config = Config.model_validate({"wheels": {"source": "ticks", "track": TRACK, **SIDES}})
+    with open_recording(handled, config.recording) as recording:
+        signals = read_signals(recording, config)
+    path = signals.path(config)
+    some = (path.times >= first_s) & (path.times <= last_s)
+    path = replace(path, times=path.times[some], poses=path.poses[some], gaps=path.gaps[some])
+    found = Conventions(config, signals)
+    assert (by_hand(found, path) is not path) == cut
+    assert bool(found.codes & HANDS) == cut
 
 
 def test_a_run_blames_nothing_else_and_does_not_fail(ran) -> None:

@@ -93,6 +93,22 @@ def test_a_lost_robot_is_not_put_back_to_the_initial_pose():
         assert np.abs(se2.between(truth, estimate.pose)).max() < 0.05
 
 
+def test_a_lost_robot_that_is_found_jumps_there_and_replays_nothing():
+    run = localizer(initial_pose=(0.0, 0.0, 0.0))
+    drive(run, (0.0, 0.0, 0.0), 0, 20)
+    run.estimator.belief.cov = np.diag([16.0, 16.0, 1.0])  # nothing was seen for long
+    found = [e for _, e in drive(run, (2.0, 1.0, 2.0), 20, 20) if e is not None]
+    assert [d.reason for e in found for d in e.decisions if d.kind == "place"] == ["jump"]
+    assert run.estimator.k == 39
+
+
+def test_the_steps_before_the_first_pose_are_replayed_from_it():
+    run = localizer()
+    told = [e for _, e in drive(run, (0.0, 0.0, 0.0), 0, 20) if e is not None]
+    assert not [d for e in told for d in e.decisions if d.reason == "jump"]
+    assert len(told) < run.estimator.k + 1 == 20
+
+
 def test_a_new_segment_does_not_go_on_from_where_the_robot_was_lost():
     run = localizer(initial_pose=(0.0, 0.0, 0.0))
     drive(run, (0.0, 0.0, 0.0), 0, 20)

@@ -132,6 +132,16 @@ def test_fault_69_publishers_of_any_quality_of_service_are_heard(reliable):
         assert wait_until(heard)
 
 
+def test_a_participant_waits_for_messages_rather_than_look_for_them_all_the_time(monkeypatch):
+    looks = []
+    monkeypatch.setattr("fgloc.live.wire.participant.in_order", lambda queues: looks.append(queues) or [])
+    with Participant(DOMAIN) as one:
+        one.read("/cmd_vel", TWIST, lambda sample: None)
+        assert wait_until(lambda: looks)
+        time.sleep(0.2)
+        assert len(looks) < 10
+
+
 def test_leaving_is_noticed_and_quick():
     one, other = Participant(DOMAIN), Participant(DOMAIN)
     writers = [one.writer("/cmd_vel", TWIST), one.writer("/odom", "nav_msgs/msg/Odometry")]

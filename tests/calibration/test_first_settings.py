@@ -1,0 +1,44 @@
+"""`fgloc init` on a short recording of odometry and a laser scanner: sections and priors that fit what is there."""
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from fgloc.calibration.first_settings import first_settings
+from fgloc.config import Config, config_of_file
+from fgloc.sensors.maps import write_map
+from fgloc.types import Landmark, LandmarkMap
+from fgloc_datasets.bag import BagWriter
+
+START_NS, BEAMS, DARK, BRIGHT = 1_700_000_000_000_000_000, 360, 100.0, 900.0
+
+
+def settings(folder, has_map=True):
+    """Of a robot that winds along for 6 s among reflectors."""
+    rng = np.random.default_rng(2)
+    with BagWriter(folder / "bag") as bag:
+        bag.static_transform(START_NS, "base_link", "laser", (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0))
+        for k in range(120):
+            stamp, yaw = START_NS + k * 50_000_000, 0.3 * math.sin(0.05 * k)
+            bag.odometry("/odom", stamp, (0.02 * k, 0.0, yaw), (0.4, 0.3 * math.cos(0.05 * k)))
+            if k % 4 == 0:
+                intensities = rng.uniform(0.5 * DARK, DARK, BEAMS)
+                intensities[[40, 100, 200, 270]] = BRIGHT
+                bag.laser_scan("/scan", stamp, np.full(BEAMS, 4.0), intensities, (-math.pi, math.pi))
+    if has_map:
+        places = {i: Landmark(i, np.array([i, 3.0, 0.0]), np.eye(3), 0.0) for i in range(4)}
+        write_map(LandmarkMap(places), folder / "map.yaml")
+    return config_of_file(yaml.safe_load(first_settings(folder / "bag").text) or {})
+
+
+def test_scans_that_only_a_setting_asks_for_are_looked_at(tmp_path):
+    assert DARK < settings(tmp_path).reflectors.min_intensity < BRIGHT
+
+
+@pytest.mark.parametrize("has_map", [True, False])
+def test_an_odometry_that_nobody_calibrated_has_wider_priors_where_a_map_can_tell_its_constants(tmp_path, has_map):
+    wheels, usual = settings(tmp_path, has_map).wheels, Config().wheels
+    assert (wheels.scale_sigma > usual.scale_sigma) == has_map
+    assert (wheels.turn_scale_sigma > usual.turn_scale_sigma) == has_map
