@@ -59,7 +59,7 @@ from fgloc_training.config import (
 )
 from fgloc_training.data import Run, SensorRecord, cut, load_run, make_run
 from fgloc_training.evaluate import STEP_S, evaluate
-from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
+from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model, roll_sources
 from fgloc_training.train import leave_one_out, train
 
 _HORIZONS_S = (10.0, 30.0, 60.0)
@@ -229,7 +229,7 @@ def _husky(scratch: Path, seeds: range, optimization: OptimizationConfig) -> Ite
     runs = {run.name: run for part in parts.values() for run in part}
     names = {part: tuple(run.name for run in found) for part, found in parts.items()}
     split = Split(train=names["train"], validation=names["validation"], test=names["test"])
-    wheels = _ends([roll_wheels(run, _HUSKY_DT_S) for run in parts["test"]], _HUSKY_S)
+    wheels = _ends([roll_sources(run, _HUSKY_DT_S) for run in parts["test"]], _HUSKY_S)
     yield Row("husky.wheels_end_m", wheels[0], unit="m")
     yield Row("husky.wheels_end_rad", wheels[1], unit="rad")
     inputs: dict[str, tuple[Input, ...]] = {
@@ -301,7 +301,7 @@ def _simulated(quick: bool, seeds: range, optimization: OptimizationConfig, scra
         }
         parts = {part: tuple(job.folder for job in mine if job.split == part) for part in _SIM_SEEDS}
         split = Split(train=parts["train"], validation=parts["validation"], test=parts["test"])
-        wheels, _ = _ends([roll_wheels(runs[name], STEP_S) for name in split.test], _SIM_S)
+        wheels, _ = _ends([roll_sources(runs[name], STEP_S) for name in split.test], _SIM_S)
         for name, (of, inputs) in _SIM.items():
             if of != scenario:
                 continue

@@ -35,7 +35,7 @@ from fgloc_training.data import Run
 from fgloc_training.models import DisplacementNet
 from fgloc_training.optimize import Checkpoint, Checkpoints
 from fgloc_training.recordings import controls, draw_controls
-from fgloc_training.rollouts import relative, roll_kinematics, roll_model, roll_wheels
+from fgloc_training.rollouts import relative, roll_kinematics, roll_model, roll_sources
 from fgloc_training.train import card_of, new_net, tensors_of
 
 
@@ -153,7 +153,7 @@ def test_wheels_with_unequal_radii_are_learned_and_slip_free_odometry_beaten(tmp
     assert card.reads("wheels")
     assert card.wheel_kinematics.yaw_per_m == pytest.approx(-0.01 / 0.26 * 2, rel=0.1)
     learned = roll_model(load_model(tmp_path / "m.safetensors"), runs["run2"], 0.2)
-    wheels = roll_wheels(runs["run2"], 0.2)
+    wheels = roll_sources(runs["run2"], 0.2)
     ratio = np.hypot(*learned.errors(5.0)[:, :2].T).mean() / np.hypot(*wheels.errors(5.0)[:, :2].T).mean()
     assert ratio < 0.2
 

@@ -13,14 +13,17 @@ from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, se
 from fgloc.config import Config, WheelsConfig
 from fgloc.errors import RecordingError
 from fgloc.sensors.gyro import ImuEvent
+from fgloc.sensors.learned import sensor as learned_sensor
 from fgloc.sensors.learned.sensor import load_model
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Event
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import DataConfig
 from fgloc_training.data import SensorRecord, load_runs
-from fgloc_training.rollouts import roll_wheels
+from fgloc_training.evaluate import evaluate, worth
+from fgloc_training.rollouts import roll_sources
 
+MODEL = Path(learned_sensor.__file__).parent / "models" / "mrclam" / "all.safetensors"
 SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
 
 
@@ -106,9 +109,20 @@ def test_the_gyros_bias_is_known_after_a_rest() -> None:
 def test_wheel_odometry_is_rolled_out_as_the_localizer_measures_it() -> None:
     run = sensing(3, 20.0)
     assert run.sensors.has_wheels
-    wheels = roll_wheels(run, 0.2)
+    wheels = roll_sources(run, 0.2)
     assert 0.002 < np.hypot(*wheels.errors(5.0)[:, :2].T).mean() < 0.1  # a wheel 2 % larger than nominal
     assert np.linalg.eigvalsh(wheels.covs).min() > 0.0
+
+
+def test_what_a_model_is_worth_is_told_beside_each_set_of_sensors() -> None:
+    run = sensing(3, 30.0)
+    drifts = worth(load_model(MODEL), [run])
+    of, how = ("commands", "wheels", "wheels and gyro"), ("without it", "with the model")
+    assert list(drifts) == [f"{sensors}, {way}" for sensors in of for way in how]
+    wheels = evaluate([roll_sources(run, 0.2)], 10.0).drift_percent
+    assert drifts["wheels, without it"] == pytest.approx(wheels)
+    assert drifts["wheels and gyro, without it"] < wheels  # one wheel is 2 % larger than nominal
+    assert drifts["wheels, with the model"] < drifts["commands, with the model"]
 
 
 def test_the_truth_teaches_the_gyros_bias_until_ten_seconds_before() -> None:

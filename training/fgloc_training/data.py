@@ -89,6 +89,11 @@ class SensorRecord:
         return by_joints or bool(self._stamps(OdometryEvent))
 
     @property
+    def has_gyro(self) -> bool:
+        """Whether there is an IMU."""
+        return bool(self._stamps(ImuEvent))
+
+    @property
     def joints(self) -> WheelJoints | None:
         """Names and sizes of the wheels' joints; None if there are no joint states."""
         if not self._stamps(JointsEvent):

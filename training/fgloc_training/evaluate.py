@@ -9,7 +9,7 @@ Windows start every second.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,12 +20,13 @@ from scipy.stats import chi2, norm
 
 from fgloc.files.outputs import write_text
 from fgloc.sensors.learned.card import Kinematics, ModelCard
+from fgloc.sensors.learned.network import MotionModel
 from fgloc.sensors.learned.sensor import load_model
 from fgloc.types import FloatArray
 from fgloc_training.calibrate import nis
 from fgloc_training.config import DataConfig
 from fgloc_training.data import Run, load_runs
-from fgloc_training.rollouts import Rollout, relative, roll_kinematics, roll_model, roll_wheels
+from fgloc_training.rollouts import Rollout, relative, roll_kinematics, roll_model, roll_sources
 
 # --- Pictures ---------------------------------------------------------------------------------------------------------
 
@@ -186,6 +187,40 @@ def card_figures(rollouts: list[Rollout]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in out.items()}
 
 
+_WORTH_S = 10.0  # without a landmark
+_WITH, _WITHOUT = "with the model", "without it"
+
+
+def worth(model: MotionModel, runs: Sequence[Run]) -> dict[str, float]:
+    """Drift over 10 s [%] of what else tells the motion in these runs, with the model and without it, by name.
+
+    Commands alone are calibrated where there is no model. Empty: no run has 10 s with truth throughout.
+    """
+    found: dict[str, list[Rollout]] = {
+        f"commands, {_WITHOUT}": [roll_kinematics(model.card.kinematics, run, STEP_S) for run in runs],
+        f"commands, {_WITH}": [roll_model(model, run, STEP_S) for run in runs],
+    }
+    beside = {"wheels": False, "wheels and gyro": True} if all(run.sensors.has_wheels for run in runs) else {}
+    for name, with_gyro in beside.items():
+        if not with_gyro or all(run.sensors.has_gyro for run in runs):
+            for label, given in ((_WITHOUT, None), (_WITH, model)):
+                found[f"{name}, {label}"] = [roll_sources(run, STEP_S, given, with_gyro) for run in runs]
+    try:
+        return {name: evaluate(rollouts, _WORTH_S).drift_percent for name, rollouts in found.items()}
+    except ValueError:
+        return {}
+
+
+def told_worth(drifts: Mapping[str, float]) -> str:
+    """Sentence on what `worth` found; empty: nothing was."""
+    names = list(dict.fromkeys(name.rpartition(",")[0] for name in drifts))
+    parts = []
+    for name in names:
+        before, after = drifts[f"{name}, {_WITHOUT}"], drifts[f"{name}, {_WITH}"]
+        parts.append(f"{name} {before:.3g} % -> {after:.3g} % with the model ({100.0 * (after / before - 1.0):+.0f} %)")
+    return f"drift over {_WORTH_S:.0f} s without a landmark: {'; '.join(parts)}" if parts else ""
+
+
 def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]]:
     """Rollouts of the models by name, and of the baselines.
 
@@ -195,7 +230,7 @@ def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]
     kinds = {"commands": Kinematics(), "calibrated commands": next(iter(loaded.values())).card.kinematics}
     found = {name: [roll_kinematics(kinematics, run, STEP_S) for run in runs] for name, kinematics in kinds.items()}
     if all(run.sensors.has_wheels for run in runs):
-        found["wheel odometry"] = [roll_wheels(run, STEP_S) for run in runs]
+        found["wheel odometry"] = [roll_sources(run, STEP_S) for run in runs]
     return found | {name: [roll_model(model, run, STEP_S) for run in runs] for name, model in loaded.items()}
 
 

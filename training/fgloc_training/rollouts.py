@@ -11,12 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fgloc import se2
+from fgloc.config import Config
 from fgloc.errors import ModelError
+from fgloc.estimation.motion import MotionSources
+from fgloc.graph.ground import predict
+from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.measurement_log import PoseWithCovariance
+from fgloc.graph.noise import NoiseBudget
+from fgloc.sensors.equipment import MotionSensors
+from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics, SignalReader
 from fgloc.sensors.learned.network import MotionModel, calibrated
+from fgloc.sensors.learned.sensor import LearnedMotion
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import FloatArray
 from fgloc_training.data import Run
+
+_FIX_RAD = 0.002  # of the truth's yaw
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,21 +99,40 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
     return replace(_roll(run, step_s, step), memory=model.card.memory)
 
 
-def roll_wheels(run: Run, step_s: float) -> Rollout:
-    """Wheel odometry as the localizer measures it.
+def roll_sources(run: Run, step_s: float, model: MotionModel | None = None, with_gyro: bool = False) -> Rollout:
+    """Dead reckoning by the wheels, and by model and gyro with them, as the localizer measures and fuses them.
+
+    The gyro's bias follows the truth, as it follows fixes until they end.
 
     Raises:
-        ModelError: the recording holds none.
+        ModelError: the recording holds no wheel odometry.
     """
     if not run.sensors.has_wheels:
         raise ModelError(f"{run.name}: no wheel odometry in the recording")
-    wheels = WheelMotion(run.sensors.wheels)
+    config = Config().model_copy(update={"wheels": run.sensors.wheels})
+    gyro = Gyro(config.gyro, run.sensors.imu_up) if with_gyro else None
+    learned = None if model is None else LearnedMotion(model, config.motion, run.sensors.imu_up)
+    wheels, joint = WheelMotion(run.sensors.wheels), None if model is None else model.joint
+    sources = MotionSources(config, MotionSensors(wheels, learned, joint, gyro))
+    history_s = 0.0 if model is None else model.card.history_s
+    origin, unknown = (
+        PoseWithCovariance(np.zeros(3), np.zeros((3, 3))),
+        InstallationEstimate(np.zeros(0), np.zeros((0, 0))),
+    )
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
-        measured = wheels.measure(run.sensors.step(start_ns, end_ns))
-        if measured is None:
-            raise ModelError(f"{run.name}: no wheel motion at {start_ns} ns")
-        return measured.motion, measured.cov
+        events = run.sensors.step(start_ns, end_ns, history_s)
+        readings = sources.read(events)
+        motions = NoiseBudget().combine(readings, sources.rules) or [sources.unknown(events, readings)]
+        after = predict(origin, unknown, sources.factors.installation, motions)
+        if gyro is not None:
+            known = round((end_ns - run.origin_ns) * 1e-9 / run.dt_s)
+            if readings.gyro is None or not run.valid[known]:
+                gyro.forget_fix()
+            else:
+                gyro.turned(float(readings.gyro.motion[2]), events.dt)
+                gyro.fix(float(run.poses[known, 2]), _FIX_RAD**2)
+        return after.pose, after.cov
 
     return _roll(run, step_s, step)
 

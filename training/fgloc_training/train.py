@@ -26,11 +26,11 @@ from fgloc.sensors.learned.sensor import Tensors, load_model, model_of, read_mod
 from fgloc_training.calibrate import adapted, fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
 from fgloc_training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
 from fgloc_training.data import Run, load_runs
-from fgloc_training.evaluate import STEP_S, card_figures, save
+from fgloc_training.evaluate import STEP_S, card_figures, save, told_worth, worth
 from fgloc_training.models import DisplacementNet, MotionNet, NaiveNet, Trunk, VelocityNet
 from fgloc_training.optimize import Checkpoints, Curve, train_mean, train_variance
 from fgloc_training.recordings import controls, draw_controls
-from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model, roll_wheels
+from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model, roll_sources
 
 # --- Networks of an ensemble ------------------------------------------------------------------------------------------
 
@@ -294,7 +294,7 @@ def held_out_rollouts(path: Path, card: ModelCard, runs: list[Run]) -> list[tupl
 
     def wheels(run: Run) -> Rollout:
         return (
-            roll_wheels(run, card.dt_s) if run.sensors.has_wheels else roll_kinematics(card.kinematics, run, card.dt_s)
+            roll_sources(run, card.dt_s) if run.sensors.has_wheels else roll_kinematics(card.kinematics, run, card.dt_s)
         )
 
     return [(roll_model(model, run, card.dt_s), wheels(run)) for run in runs]
@@ -417,7 +417,7 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, r
     with atomic_folder(out, own=("*.safetensors", "*.png", CHECKPOINTS)) as stage:
         if start is not None:
             path = stage / "model.safetensors"
-            reporter.say(_figures(path.stem, adapt(start, config, runs, path, f"{made_by}; from {start.name}")))
+            reporter.say(_figures(path, adapt(start, config, runs, path, f"{made_by}; from {start.name}"), runs))
         else:
             _train_all(config, runs, stage, made_by, Checkpoints(out / CHECKPOINTS), reporter)
         names = sorted(path.name for path in stage.glob("*.safetensors"))
@@ -436,14 +436,15 @@ def _train_all(
     if config.split is not None:
         path = out / "model.safetensors"
         card = train(config, config.split, runs, path, made_by, checkpoints, reporter.warn)
-        reporter.say(_figures(path.stem, card))
+        reporter.say(_figures(path, card, runs))
         return
     folds = []
     for split in leave_one_out(list(runs)):
         path = out / f"without_{split.test[0]}.safetensors"
         folds.append(train(config, split, runs, path, made_by, checkpoints, reporter.warn))
-        reporter.say(_figures(path.stem, folds[-1]))
-    reporter.say(_figures("all", train_on_all(config, runs, folds, out / "all.safetensors", made_by, checkpoints)))
+        reporter.say(_figures(path, folds[-1], runs))
+    path = out / "all.safetensors"
+    reporter.say(_figures(path, train_on_all(config, runs, folds, path, made_by, checkpoints), {}))
 
 
 def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
@@ -455,6 +456,9 @@ def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
     return Split(train=names(split.train), validation=names(split.validation), test=names(split.test))
 
 
-def _figures(name: str, card: ModelCard) -> str:
+def _figures(path: Path, card: ModelCard, runs: Mapping[str, Run]) -> str:
+    """Figures of a model, and what it is worth in the recordings that it was not trained on."""
     figures = ", ".join(f"{k} {v:g}" for k, v in card.figures.items() if k.startswith(("drift", "nis")))
-    return f"{name}: {figures}"
+    tested = [runs[name] for name in card.split.test or card.split.validation if name in runs]
+    told = told_worth(worth(load_model(path), tested)) if tested else ""
+    return f"{path.stem}: {figures}" + (f"\n{path.stem}: {told}" if told else "")
