@@ -15,7 +15,8 @@ installed, drive by control functions that no training has seen: corners without
   that of ``frozen`` or of ``none``.
 - ``worth.SENSORS.CHANGE.WAY.ate_mm``: runs of three seeds with wheels (``wheels``), with wheels and gyro (``gyro``): mean error.
 - ``wheels_only.dark60.MODE.{ate_mm,nees_over_3}``: robots of `benchmarks.installed` on slippery patches, a minute dark,
-  whose gyro and model are taken away.
+  whose gyro and model are taken away; ``.sound_named``: share of the runs in which a sound marker is accused.
+- ``foreign.dark20.*``: likewise on a grippy floor, with a model of another robot in place of their own, dark from 1 to 21 s.
 - ``step_over_frozen``: time of a step with adaptation over that without, of the runs of ``floor``; the spread is over them.
 
 The form of the gains was chosen on free rollouts of seeds 131 to 135 of the changes floor, wheel and both, their noise on
@@ -40,7 +41,7 @@ import torch
 
 import fgloc_training
 from benchmarks import drives
-from benchmarks.common import Row, main
+from benchmarks.common import MODELS, Row, main
 from benchmarks.recordings import SEEDS, Recorded, Split, Take, cache_folder, changed, load, scenario
 from benchmarks.replays import failure, failures, kept, parallel, replayed
 from benchmarks.scores import errors
@@ -73,6 +74,7 @@ _WORTH_SEEDS, _WORTH_CHANGES = 3, ("floor", "wheel")
 _TRAIN_SEEDS = {"train": (11, 12, 13), "validation": (21, 22)}
 _DURATION_S, _FIXES_S, _DARK_S = 300.0, 120.0, 30.0
 _WORSE = 1.05
+_FOREIGN_DARK_S = (1.0, 21.0)
 _DATA = DataConfig(smoothing_s=0.1)  # the truth is exact
 
 
@@ -115,7 +117,7 @@ def measure(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
         for s in seeds
     ]
     yield _row("step_over_frozen", ratios)
-    yield from _wheels_only(quick, split, jobs)
+    yield from _installed(quick, split, jobs)
 
 
 def _row(name: str, values: Sequence[float], unit: str = "") -> Row:
@@ -274,33 +276,48 @@ def model(change: str) -> Path:
     return path
 
 
-# --- Wheels alone in the dark -----------------------------------------------------------------------------------------
+# --- Robots of `benchmarks.installed` in the dark --------------------------------------------------------------------
 
 
-def _wheels_only(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
+def _installed(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
     seeds = SEEDS[split][: 1 if quick else None]
-    cells = list(parallel(_wheels_only_cell, [(split, seed) for seed in seeds], jobs))
-    for mode in ("batch", "online"):
-        yield _row(f"wheels_only.dark60.{mode}.ate_mm", [cell[mode][0] for cell in cells], "mm")
-        yield _row(f"wheels_only.dark60.{mode}.nees_over_3", [cell[mode][1] for cell in cells])
+    kinds = ("wheels_only", "foreign")
+    cells = dict(parallel(_installed_cell, [(kind, split, seed) for kind in kinds for seed in seeds], jobs))
+    for kind, name in zip(kinds, ("wheels_only.dark60", "foreign.dark20"), strict=True):
+        found = [cells[kind, split, seed] for seed in seeds]
+        for mode in ("batch", "online"):
+            yield _row(f"{name}.{mode}.ate_mm", [cell[mode][0] for cell in found], "mm")
+            yield _row(f"{name}.{mode}.nees_over_3", [cell[mode][1] for cell in found])
+        yield Row(f"{name}.sound_named", sum(cell["named"] > 0 for cell in found) / len(found), n=len(found))
 
 
-def _wheels_only_cell(key: tuple[Split, int]) -> dict[str, Any]:
-    split, seed = key
-    return dict(kept(f"learning_wheels_only_{split}_{seed}", lambda: run_wheels_only(split, seed)))
+def _installed_cell(key: tuple[str, Split, int]) -> tuple[tuple[str, Split, int], dict[str, Any]]:
+    kind, split, seed = key
+    return key, dict(kept(f"learning_{kind}_{split}_{seed}", lambda: run_installed(kind, split, seed)))
 
 
-def run_wheels_only(split: Split, seed: int) -> dict[str, Any]:
-    """Error and NEES/3 in batch and online of a robot on slippery patches with nothing but wheels, a minute dark."""
-    recorded = load(Take("installed", "patches", split, seed))
+def run_installed(kind: str, split: Split, seed: int) -> dict[str, Any]:
+    """Error and NEES/3 in batch and online, and how often a sound marker was named, of a robot without a gyro.
+
+    Args:
+        kind: ``wheels_only`` (slippery patches, a minute dark) or ``foreign`` (a grippy floor and a model of another
+            robot, 20 s dark before the sightings could show that it is one).
+        split: of the seed.
+        seed: of `benchmarks.installed`.
+    """
+    recorded = load(Take("installed", "patches" if kind == "wheels_only" else "unequal_radii", split, seed))
     recorded = replace(recorded, events=tuple(e for e in recorded.events if not isinstance(e, ImuEvent)))
-    config = changed(recorded.config, {"motion": {"use": False}})
-    made = replayed(recorded, config, failures("dark60", recorded), seed, batch=True)
+    motion = {"use": False} if kind == "wheels_only" else {"model": MODELS / "all.safetensors", "use": True}
+    config = changed(recorded.config, {"motion": motion})
+    dark = {"kind": "dropout", "sensor": "camera", "when": {"intervals": [_FOREIGN_DARK_S]}}
+    chain = failures("dark60", recorded) if kind == "wheels_only" else [failure(dark)]
+    made = replayed(recorded, config, chain, seed, batch=True)
     if made is None or made.batch is None:
-        raise FglocError(f"seed {seed}: no pose was ever found")
+        raise FglocError(f"{kind}, seed {seed}: no pose was ever found")
     unknown = made.unknown_ns(recorded.start_ns)
     scores = {mode: errors(getattr(made, mode), config, unknown) for mode in ("batch", "online")}
-    return {mode: (found.ate_mm, found.nees_over_3) for mode, found in scores.items()}
+    named = sum(d.reason in ("quarantined", "landmark_moved") for d in made.online.decisions)
+    return {mode: (found.ate_mm, found.nees_over_3) for mode, found in scores.items()} | {"named": named}
 
 
 if __name__ == "__main__":

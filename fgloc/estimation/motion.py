@@ -395,6 +395,7 @@ def _systematic(a: MotionMeasurement, b: MotionMeasurement, factors: LandmarkFac
 
 # --- Which sources are rejected, and since when -----------------------------------------------------------------------
 
+_STILL = 0.02  # of the reference source's travel: encoders that jitter count less
 _MOVED = 0.25  # of the reference source's travel: a wheel that turned less stood still, one that lacks less turned
 # Travel by the reference source from which a wheel is known to have turned or to have stood. Over a shorter way a robot
 # slides on with its wheels at rest: 0.08 m from 0.4 m/s at a friction of 0.1.
@@ -448,6 +449,7 @@ class MotionFaultMonitor:
         self._differing_steps = 0  # for how many steps the two have differed
         self._agreed_m = self._disputed_m = 0.0  # ways over which they agreed, and differed without a judgement
         self._proven = False  # whether the model has agreed with the wheels for long, or with sightings against them
+        self._doubted_steps = 0  # since both were doubted, and sightings have not told which was wrong
 
     def begin(self, step: Step) -> None:
         """Begin the test with the first step of the run, or of a segment."""
@@ -506,12 +508,19 @@ class MotionFaultMonitor:
         undecided = found is None and not was_left_out and self._compares_model(readings)
         if undecided:
             self._record_agreement(readings, verdict)
-        if undecided and verdict.flagged and not self._proven and self._reason == "slip":
+        self._doubted_steps += self._doubted_steps > 0
+        if undecided and verdict.flagged and not self._proven and not self._stands_still():
             wrong = dict.fromkeys(("wheels", "learned"), DOUBTED)
+            self._doubted_steps = max(self._doubted_steps, since, 1)
         before, self._wrong_before = self._wrong_before, wrong
         if verdict.flagged:
             self._count(before.get("wheels"), wrong.get("wheels"), since)
         news = "wheels" in contradicted or ("learned" in contradicted and not was_left_out)
+        doubted = self._doubted_steps
+        if found is not None:
+            self._doubted_steps = 0
+            if contradicted == {"learned"} and doubted:  # a model of another robot is wrong all the time: it was then
+                return wrong, max(doubted, found.steps)
         if since or found is None or not news or before.keys() == wrong.keys():
             return wrong, since
         return wrong, found.steps
@@ -587,6 +596,12 @@ class MotionFaultMonitor:
         if self._track_m is not None and stood[1] and turned[0]:
             return "right_wheel_dead"
         return "slip" if since else self._reason
+
+    def _stands_still(self) -> bool:
+        """Whether a wheel that should have turned reports nothing, which no model of another robot feigns."""
+        _, *ways = np.sum(self._travels, axis=0) if self._travels else np.zeros(5)
+        by_wheels, did = np.reshape(ways, (2, 2))
+        return self._reason != "slip" and bool(((did > _LEAST_M) & (by_wheels < _STILL * did)).any())
 
     def _sides(self, motion: FloatArray) -> tuple[float, float]:
         """How far the left and the right wheel went [m]."""

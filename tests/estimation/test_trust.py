@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgloc.config import Config, WeightsConfig
-from fgloc.estimation.faults import GlrTest
+from fgloc.estimation.faults import Contradicted, GlrTest
 from fgloc.estimation.motion import MotionFaultMonitor, MotionSources
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.wheels.motion import WheelMotion
@@ -119,10 +119,10 @@ class Witness:
                 return False
 
 
-def trust_in(distrust=(), learned=True, track=TRACK, **weights) -> MotionFaultMonitor:
+def trust_in(distrust=(), learned=True, track=TRACK, attribution=None, **weights) -> MotionFaultMonitor:
     config = Config.model_validate({"weights": {"distrust": distrust, **weights}})
     sources = MotionSources(config, MotionSensors(WheelMotion(config.wheels), Witness() if learned else None))
-    trust = MotionFaultMonitor(config.weights, sources, track)
+    trust = MotionFaultMonitor(config.weights, sources, track, attribution)
     trust.begin(Step(0, 0, 10**18, 10**18))
     return trust
 
@@ -294,3 +294,36 @@ def test_wheels_that_differ_by_less_than_an_alarm_are_worth_less_back_to_the_ons
     assert [t.budget.scale for t in found] == sorted(t.budget.scale for t in found)
     assert found[0].budget.scale < 1.0
     assert 4.0 < found[-1].budget.scale < 5.0
+
+
+@pytest.mark.parametrize(("left", "reasons"), [(0.1 * LEFT, {"doubted"}), (0.0, {"doubted", "left_wheel_dead"})])
+def test_a_model_that_was_never_right_makes_no_slow_wheel_a_dead_one(left, reasons):
+    """A wheel that counts nothing is dead whoever says that it should turn."""
+    found = run(trust_in(), 40, sides(left, RIGHT))
+    assert {t.budget.rejected["wheels"] for t in found if t.budget.rejected} == reasons
+
+
+class Sightings:
+    """Says what sightings contradict from a step on; before, nothing can be seen."""
+
+    memory_s = 10.0
+
+    def __init__(self, sources: frozenset[str]) -> None:
+        self.sources, self.seen = sources, False
+
+    def contradicted(self, steps):
+        return Contradicted(self.sources, 5) if self.seen else None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "earlier"), [({"learned"}, {"learned": "contradicted"}), ({"wheels"}, {"wheels": "slip"})]
+)
+def test_a_model_that_sightings_contradict_was_wrong_for_as_long_as_both_were_doubted(wrong, earlier):
+    """A slip of the wheels says nothing of the time before."""
+    sightings = Sightings(frozenset(wrong))
+    trust = trust_in(attribution=sightings)
+    assert run(trust, 100, sides(1.4 * LEFT, 1.5 * RIGHT))[-1].budget.rejected.keys() == {"wheels", "learned"}
+    sightings.seen = True
+    found = run(trust, 1, sides(1.4 * LEFT, 1.5 * RIGHT), first=100)[0]
+    assert found.budget.rejected == found.earlier.rejected == earlier
+    assert found.span == (101 if wrong == {"learned"} else 5)
