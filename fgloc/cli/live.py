@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +16,7 @@ import typer
 
 from fgloc.cli.options import Bag, ModelOption, configured, need
 from fgloc.cli.terminal import EXIT_LOST, columns, run_bar, say, say_remark
-from fgloc.errors import ConfigError
+from fgloc.errors import ConfigError, FglocError
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from fgloc.types import LandmarkMap
 
 _SWITCH_S = 1e-3  # the thread that publishes waits no longer than this for the one that estimates
-_STATUS_S = 0.5  # time between two changes of the status line
+_STATUS_S = 0.5  # time between two changes of the status line ...
+_LOGGED_S = 60.0  # ... and between two lines of a log in which nothing changes
 
 DomainOption = Annotated[int, typer.Option("--domain", metavar="N", envvar="ROS_DOMAIN_ID", help="DDS domain")]
 NetworkOption = Annotated[
@@ -160,9 +161,10 @@ def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator
 
 @contextmanager
 def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
-    """Show the pose in one line while the block runs, on a terminal only."""
+    """Show mode and pose while the block runs: on a terminal in one line, else at a change and each minute."""
     if not sys.stderr.isatty():
-        yield
+        with _regularly(_logged(node), stop):
+            yield
         return
     from rich.console import Console
     from rich.live import Live
@@ -171,26 +173,59 @@ def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
     on_screen = sys.stdout.isatty()  # then what is printed goes above the line
     console = Console(stderr=True)
     with Live(Text(), console=console, auto_refresh=False, transient=True, redirect_stdout=on_screen) as line:
-        ended = threading.Event()
 
         def show() -> None:
-            while not stop.is_set() and not ended.wait(_STATUS_S):
-                pose = None if node.live is None else node.live.pose_at()
-                if pose is not None:
-                    x, y, yaw = pose.pose
-                    sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
-                    status = None if node.live is None else node.live.status()
-                    state = pose.mode if status is None else status.stale or status.alert or pose.mode
-                    text = f"{state}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
-                    line.update(Text(text), refresh=True)
+            if (found := _state_and_pose(node)) is not None:
+                line.update(Text("  ".join(found)), refresh=True)
 
-        showing = threading.Thread(target=show, name="fgloc-status-line", daemon=True)
-        showing.start()
-        try:
+        with _regularly(show, stop):
             yield
-        finally:
-            ended.set()
-            showing.join()
+
+
+@contextmanager
+def _regularly(work: Callable[[], None], stop: threading.Event) -> Iterator[None]:
+    """Do a piece of work every `_STATUS_S` while the block runs."""
+    ended = threading.Event()
+
+    def repeat() -> None:
+        with suppress(FglocError):  # the run has failed, and says so itself
+            while not stop.is_set() and not ended.wait(_STATUS_S):
+                work()
+
+    thread = threading.Thread(target=repeat, name="fgloc-status-line", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _logged(node: Node) -> Callable[[], None]:
+    """Function that prints the state when it changes, and once a minute."""
+    last, said_s = "", 0.0
+
+    def show() -> None:
+        nonlocal last, said_s
+        found = _state_and_pose(node)
+        if found is not None and (found[0].partition(" ")[0] != last or time.monotonic() > said_s + _LOGGED_S):
+            last, said_s = found[0].partition(" ")[0], time.monotonic()
+            _tell("  ".join(found))
+
+    return show
+
+
+def _state_and_pose(node: Node) -> tuple[str, str] | None:
+    """Mode (or what is stale, or an alert) and newest pose as texts; None: there is none yet."""
+    live = node.live
+    pose = None if live is None else live.pose_at()
+    if live is None or pose is None:
+        return None
+    x, y, yaw = pose.pose
+    sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
+    status = live.status()
+    state = status.stale or status.alert or str(pose.mode)
+    return state, f"x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
 
 
 def _with_initial_pose(config: Config, text: str | None) -> Config:

@@ -1,6 +1,7 @@
 """``fgloc live`` and ``fgloc play``: poses on the wire are those of an online run; frames, map, commands."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -371,6 +372,7 @@ def test_two_commands_as_two_processes(tmp_path):
     assert int(summary["keyframes"]) == pytest.approx(20, abs=6), said
     assert "Subscribed: /odom (odometry)." in said
     assert "last mode" in said
+    assert re.search(r"^\w.*  x -?\d\.\d+ m  y", said, re.MULTILINE)  # no terminal is needed to see where it is
     assert (tmp_path / "state.json").stat().st_size > 100
 
 
