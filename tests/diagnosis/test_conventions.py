@@ -16,6 +16,7 @@ from fgloc.config import Config, config_of, config_of_file
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.mistakes import inspect_all
+from fgloc.diagnosis.odometry import check_odometry
 from fgloc.diagnosis.pairs import Figure
 from fgloc.diagnosis.signals import Path as Odometry
 from fgloc.diagnosis.signals import Signals
@@ -218,6 +219,25 @@ def test_a_clock_that_drifts_is_not_late(late, codes):
     assert conventions(signals, Config()).codes == codes
 
 
+@pytest.mark.parametrize(
+    ("factor", "late_s", "codes"),
+    [
+        (1.0, 0.0, set()),
+        (-1.0, 0.0, {"odometry.yaw_sign"}),
+        (180.0 / math.pi, 0.0, {"odometry.yaw_unit"}),
+        (1.0, 0.4, {"odometry.twist_late"}),
+    ],
+    ids=["sound", "sign", "degrees", "late"],
+)
+def test_a_yaw_rate_is_compared_with_the_odometrys_own_yaw(factor, late_s, codes):
+    rates = factor * RATE[np.maximum(np.arange(len(TIMES)) - round(late_s / STEP_S), 0)]
+    rows = list(zip(*(c[::10].tolist() for c in (TIMES, X, Y, YAW, SPEED, 0.0 * SPEED, rates)), strict=True))
+    motion = [odometry(t, (x, y, yaw), (v, w)) for t, x, y, yaw, v, _, w in rows]
+    found = Conventions(Config(), Signals(motion=motion, odometry=rows))
+    check_odometry(found)
+    assert found.codes == codes
+
+
 @pytest.mark.slow
 def test_ranges_that_are_said_to_be_depths_and_are_not_are_named(tmp_path):
     bag = record(tmp_path, Broken())
@@ -255,6 +275,15 @@ def test_a_truth_tells_its_clock_only_where_its_yaw_follows_the_wheels(share, la
     found = Conventions(Config(), Signals())
     check_body(found, BodyFit(False, as_is, as_is, none, none, none, Figure(late, 0.001), 0.01, share))
     assert found.codes == ({"clock.truth"} if is_named else set())
+
+
+@pytest.mark.parametrize(("scale", "severity"), [(1.02, None), (1.06, Severity.WARNING), (1.12, Severity.ERROR)])
+def test_a_truth_that_finds_wheels_beyond_what_a_run_estimates_is_an_error(scale, severity):
+    as_is, none = Figure(1.0, 0.001), Figure(0.0, 0.001)
+    found = Conventions(config_of({"wheels": {"scale_sigma": 0.02}}), Signals())
+    check_body(found, BodyFit(False, as_is, Figure(scale, 0.001), none, none, none, none, 0.01, 0.9))
+    expected = [] if severity is None else [("wheels.scale", severity)]
+    assert [(f.code, f.severity) for f in found.findings] == expected
 
 
 def test_a_truth_tells_how_much_wheels_turn(tmp_path):

@@ -203,6 +203,14 @@ def test_the_motion_of_wheels_and_gyro_fits_poses_on_a_circle_only_if_they_are_t
         assert [r < 0.05 for r in residuals] == [close] * len(residuals)
 
 
+def test_wheels_without_noise_are_not_exact():
+    noise = dict.fromkeys(Config().wheels.noise.model_dump(), 0.0)
+    config = Config.model_validate({"wheels": {"noise": noise}})
+    stretch = Stretch(np.array([0.5, 1.5]), (), np.tile([0.02, 0.0, 0.03], (100, 1)), None, START_NS)
+    _, sigmas, _ = Motion([stretch], np.eye(3), config).between(np.zeros(len(EXTRAS)))
+    assert (sigmas > 0.0).all()
+
+
 # --- by the messages alone ---
 
 

@@ -11,7 +11,7 @@ import pytest
 from fgloc import se2
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, config_of
-from fgloc.diagnosis.sanity import Placed, Track, Watch, gyro_agrees, judged
+from fgloc.diagnosis.sanity import Placed, Track, Watch, chained, gyro_agrees, judged
 from fgloc.errors import FglocError
 from fgloc.estimation.localizer import Localizer
 from fgloc.evaluation.metrics import compute_metrics
@@ -150,6 +150,18 @@ def test_odometry_in_place_of_the_estimate_has_an_honest_covariance():
         off[2] = se2.wrap(off[2])
         nees.append(off @ np.linalg.solve(last.cov, off) / 3.0)
     assert 0.02 < np.mean(nees) < 2.0
+
+
+def test_the_odometry_adds_up_motions_to_the_side_too_and_stands_where_one_is_not_known():
+    poses, motions, rng = driven(50)
+    motions[:, 1] = 0.03
+    joined = np.ones(50, dtype=np.int64)
+    joined[20] = 0
+    track = dataclasses.replace(track_of(poses, motions, rng, ids=()), joined=joined)
+    expected = [np.zeros(3)]
+    for k in range(1, 50):
+        expected.append(se2.compose(expected[-1], motions[k] * joined[k]))
+    np.testing.assert_allclose(chained(track), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("coordinate", [0, 2], ids=["way", "turn"])

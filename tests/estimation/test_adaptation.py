@@ -11,7 +11,9 @@ from robot_world import START_NS, Chain, World, config, nees, position_error, ro
 
 from fgloc import se2
 from fgloc.config import Config, MotionConfig
+from fgloc.estimation.motion import ExcessDrift
 from fgloc.graph.installation import Installation, InstallationEstimate
+from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import FusionRules, NoiseBudget
 from fgloc.live.state import InstallationState as State
 from fgloc.live.state import resumed_installation
@@ -81,6 +83,19 @@ def test_noise_of_drift_grows_with_the_time_and_with_nothing_at_rest():
         assert np.diag(made.cov) == pytest.approx(seconds * np.array([1.0, 1.0, 2.0]), rel=1e-3)
         (still,) = budget.combine(MotionReadings(replace(driving, motion=np.zeros(3))), rules)
         assert np.diag(still.cov).max() < 1e-8
+
+
+def test_one_stretch_that_ended_elsewhere_is_counted_among_half_a_minute_of_calm():
+    estimator, exact = Chain(config(), room()).localizer.estimator, 1e-8 * np.eye(3)
+    drift = ExcessDrift(estimator)
+    drift.fix(estimator.start(0, PoseWithCovariance(np.zeros(3), exact)))
+    for k in range(25):
+        step = Step(k, 0, k * 10**8, (k + 1) * 10**8)
+        went = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, np.array([0.04, 0.0, 0.0]), exact)
+        drift.advance(step, [went])
+    assert drift.density is None
+    drift.fix(PoseWithCovariance(np.array([1.3, 0.0, 0.0]), exact))
+    assert drift.density == pytest.approx(0.3**2 / 32.5 * np.array([0.5, 0.5, 0.0]), rel=0.1, abs=1e-9)
 
 
 def test_noise_of_the_models_drift_is_the_models_alone():

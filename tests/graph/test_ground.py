@@ -78,6 +78,17 @@ def test_turning_on_a_slope_turns_the_slope_in_the_robots_axes() -> None:
     np.testing.assert_allclose(found.after[1:], (-slope, 0.0), atol=1e-9)
 
 
+def test_a_height_is_less_sure_where_the_slope_changes_and_not_on_a_steady_one() -> None:
+    way, turn = [0.2, 0.0, 0.0], reading([0.0, 0.02])
+    level, steady, bent = (
+        step(way, (0.0, 0.0, pitch), inertial).cov[0, 0]
+        for pitch, inertial in ((0.0, reading([0.0, 0.0])), (-0.3, reading([0.0, 0.0])), (0.0, turn))
+    )
+    along = np.sin(0.3) ** 2 * 1e-4  # of the motion, seen in the height
+    assert steady == pytest.approx(level + along, rel=0.01)
+    assert bent > 2.0 * level
+
+
 def step(motion, ground, inertial=None, of: Installation | None = None, theta=None):
     of = of or installation()
     motions = [moved(motion, inertial)]

@@ -19,9 +19,10 @@ from robot_world import CAMERA, START_NS, World, beacons, config, nees, room, tr
 from world_bags import write_world
 
 import fgloc
-from fgloc.config import Config, load_config, yaml_of
+from fgloc.config import Config, TopicsConfig, load_config, yaml_of
 from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
+from fgloc.live.engine import DetectionWorker, Queued, State
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
@@ -30,7 +31,7 @@ from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.detector import TrackingDetector
 from fgloc.sensors.markers.images import ImageEvent
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.types import Mode, TransformEvent, TruthEvent
+from fgloc.types import Mode, RawEvent, TransformEvent, TruthEvent
 
 SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
 WAITED_S = 0.3  # what a slow detector of these tests takes
@@ -230,6 +231,31 @@ def test_many_threads_may_push_and_ask():
     assert not failed
     assert {topic: t.count for topic, t in status.topics.items()} == {k[0].topic: len(k) for k in kinds}
     assert status.queued_events == status.queued_images == 0
+
+
+def test_an_image_that_was_looked_at_waits_no_more():
+    sample = SAMPLES / "first_run"
+    settings = load_config(sample / "robot.yaml")
+    with open_recording(sample / "bag", settings.recording) as recording:
+        events, roles = until(1.0, recording.events()), recording.roles
+    with Live(settings, sample / "map.yaml", roles=roles) as live:
+        made = feed(live, events)
+        assert live.status().queued_images == 0
+    assert any(isinstance(e, ImageEvent) for e in events)
+    assert made
+
+
+def test_of_images_that_wait_the_oldest_gives_way_to_a_new_one():
+    changed = threading.Condition()
+    worker = DetectionWorker(changed, 3, TopicsConfig())
+    images = [Queued(RawEvent(k, k, "/image", "cam"), State.WAITING, True) for k in range(5)]
+    with changed:
+        for image in images:
+            worker.arrived(image)
+    worker.stop()
+    assert [image.event is None for image in images] == [image.state is State.GONE for image in images]
+    assert [image.state for image in images] == [State.GONE] * 2 + [State.WAITING] * 3
+    assert (worker.queued, worker.dropped) == (3, 2)
 
 
 def test_under_overload_the_oldest_waiting_image_is_dropped(monkeypatch):
