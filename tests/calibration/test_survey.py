@@ -8,17 +8,19 @@ import re
 import numpy as np
 import pytest
 from refusal import refusal
-from robot_world import SIGMA_PX, World, config, room, standing, truth_at
+from robot_world import CAMERA, SIGMA_PX, World, config, project, room, standing, truth_at
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 from world_bags import write_world
 
-from fgloc.calibration.survey import Distance, aligned, planar_matrix, survey
+from fgloc.calibration.survey import Distance, aligned, mirrored, moved_by, planar_matrix, survey
 from fgloc.cli import app
 from fgloc.errors import ConfigError, MapError, RecordingError
 from fgloc.evaluation.metrics import match_result
+from fgloc.graph.installation import MARKER, Installation
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
+from fgloc.sensors.measurements import PixelMeasurement
 from fgloc.types import LandmarkMap
 from fgloc_datasets import SAMPLE
 
@@ -219,6 +221,30 @@ def test_frames_are_aligned_though_some_markers_were_moved():
         known[i] = planar_matrix((1.0, 0.5, 1.0)) @ known[i]
     assert np.allclose(aligned(known, found), motion, atol=1e-9)
     assert aligned({}, found) is None
+
+
+def test_frames_are_not_aligned_by_markers_of_which_most_were_moved_by_a_metre():
+    rng, known = np.random.default_rng(6), {}
+    for i, m in room().landmarks.items():
+        known[i] = matrix(m)
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        known[i][:2, 3] += rng.uniform(1.0, 1.5) * np.array([np.cos(angle), np.sin(angle)])
+    assert aligned(known, {i: matrix(m) for i, m in room().landmarks.items()}) is None
+
+
+def test_a_marker_turned_the_wrong_way_is_found_again_from_the_other_side():
+    true = standing(3, 2.0, 0.4, np.pi + 0.6)
+    poses = [np.array([x, y, 0.1]) for x in (0.0, 0.3) for y in (-0.4, 0.0, 0.3)]
+    noise = np.random.default_rng(7).normal(0.0, 0.3, (len(poses), 4, 2))
+    seen = [PixelMeasurement(0, 3, project(p, true) + n, 0.5, CAMERA) for p, n in zip(poses, noise, strict=True)]
+    installation = Installation({f"map.3.{name}": 0.5 for name in MARKER})
+    about = moved_by(true, np.array([0.2, -0.1, 0.1, 0.2, 0.2, -0.2]))
+    wrong = mirrored(about, seen, poses, installation, np.zeros(6))
+    right = mirrored(wrong.landmark, seen, poses, installation, np.zeros(6))
+    assert wrong.gain < -20.0
+    assert right.gain == pytest.approx(-wrong.gain, rel=0.01)
+    assert np.linalg.norm(right.landmark.position - true.position) < 0.03
+    assert Rotation.from_matrix(right.landmark.rotation.T @ true.rotation).magnitude() < 0.05
 
 
 def matrix(landmark):

@@ -12,7 +12,19 @@ from test_observation import scene
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.frames import quaternion_matrix, rpy_matrix, rpy_quaternion
-from fgloc.graph.ground import GRAVITY, driven, gravity, ground_step, levelled, planar_turn, predict, spatial
+from fgloc.graph.factors import INSTALLATION, ground_key
+from fgloc.graph.ground import (
+    GRAVITY,
+    driven,
+    gravity,
+    ground_factors,
+    ground_step,
+    levelled,
+    planar_turn,
+    predict,
+    spatial,
+    step_of,
+)
 from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
 from fgloc.graph.joint import fuse_installed, predict_on_plane
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -123,6 +135,26 @@ def test_a_tilted_imu_sees_a_turn_about_its_other_axes() -> None:
     assert found.turning is not None
     np.testing.assert_allclose(found.turning.turn, 0.0, atol=1e-4)
     assert found.turning.D[0, IMU.index("gyro.pitch_rad")] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("names", [(), IMU], ids=["none", "imu"])
+def test_factors_of_the_ground_hold_where_a_step_leads_and_gravity_agrees(names) -> None:
+    of = installation(*names)
+    theta, turn = np.zeros(of.constants + 3), np.array([0.03, -0.05])
+    after = step_of([moved([0.15, 0.01, 0.3], reading(turn))], theta, of).after
+    force = rpy_matrix(after[1], after[2], 0.0).T @ np.array([0.0, 0.0, GRAVITY])
+    motions = [moved([0.15, 0.01, 0.3], reading(turn, force))]
+    found = step_of(motions, theta, of)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for factor in ground_factors(1, motions, found, theta, of):
+        graph.add(factor)
+    values.insert(ground_key(0), found.before)
+    values.insert(ground_key(1), found.after)
+    if names:
+        values.insert(INSTALLATION, theta[: of.constants])
+    assert found.turning is not None
+    turned = 0.5 * float(turn @ turn) / found.turning.variance  # which bias or mounting would have to explain
+    assert graph.error(values) == pytest.approx(turned if names else 0.0, abs=1e-9)
 
 
 def test_gravity_tells_roll_and_pitch() -> None:

@@ -83,6 +83,17 @@ def test_however_long_the_robot_stood_it_takes_twenty_seconds_of_motion_at_most(
     assert stands_s < (event.stamp_ns - START_NS) * 1e-9 < stands_s + 20.0
 
 
+def test_signals_are_compared_once_they_are_many_more_than_before_and_at_the_end():
+    diagnosis, due = Diagnosis(config(), beacons(), None, None, None), []
+    for event in swerving(seconds=50.0):
+        diagnosis.add(event)
+        if diagnosis.comparison() is not None:
+            due.append((event.stamp_ns - START_NS) * 1e-9)
+    assert due == pytest.approx([20.0, 40.0], abs=0.2)
+    assert diagnosis.comparison(ended=True) is not None
+    assert diagnosis.comparison(ended=True) is None
+
+
 @pytest.mark.slow
 def test_a_mirrored_sensor_is_named_live():
     with Live(config(), beacons(), roles=("odometry", "sightings")) as live:
