@@ -34,7 +34,7 @@ class Seen:
 
 
 def textbook_poses(
-    start: FloatArray, motions: FloatArray, seen: Seen, landmarks: Mapping[int, FloatArray] | None
+    start: FloatArray, motions: FloatArray, seen: Seen, landmarks: Mapping[int, FloatArray]
 ) -> tuple[FloatArray, FloatArray] | None:
     """Poses ``(n, 3)`` of the textbook's smoother with covariances ``(n, 3, 3)``, right perturbation.
 
@@ -42,7 +42,7 @@ def textbook_poses(
         start: ``(n, 3)`` initial values.
         motions: ``(n - 1, 3)`` odometry between the poses.
         seen: all usable sightings.
-        landmarks: places ``(2,)`` by id of a known map; None: they are variables, and the first pose is held.
+        landmarks: places ``(2,)`` of the map by id.
 
     Returns:
         None if it does not converge to finite poses.
@@ -52,9 +52,7 @@ def textbook_poses(
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, pose in enumerate(start):
         values.insert(k, gtsam.Pose2(*pose))
-    free = landmarks is not None
-    first = _sigmas(_START_M, _START_M, _START_RAD) if free else _sigmas(1e-3, 1e-3, 1e-3)
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start[0]), first))
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start[0]), _sigmas(_START_M, _START_M, _START_RAD)))
     for k, motion in enumerate(motions):
         length, turn = math.hypot(motion[0], motion[1]), abs(motion[2])
         m = math.hypot(_STEP_M_PER_SQRT_M * math.sqrt(length), _STEP_FLOOR)
@@ -65,17 +63,14 @@ def textbook_poses(
     for k, landmark_id, place, sigma in zip(
         seen.pose.tolist(), seen.ids.tolist(), seen.places, seen.sigmas, strict=True
     ):
-        if landmarks is not None and landmark_id not in landmarks:
+        if landmark_id not in landmarks:
             continue
         key = gtsam.symbol("l", landmark_id)
         if landmark_id not in placed:
             placed.add(landmark_id)
-            if landmarks is None:
-                values.insert(key, gtsam.Pose2(*start[k]).transformFrom(place))
-            else:
-                values.insert(key, landmarks[landmark_id])
-                surveyed = gtsam.noiseModel.Isotropic.Sigma(2, _MAP_M)
-                graph.add(gtsam.PriorFactorPoint2(key, landmarks[landmark_id], surveyed))
+            values.insert(key, landmarks[landmark_id])
+            surveyed = gtsam.noiseModel.Isotropic.Sigma(2, _MAP_M)
+            graph.add(gtsam.PriorFactorPoint2(key, landmarks[landmark_id], surveyed))
         distance = math.hypot(*place)
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma / max(distance, sigma), sigma]))
         robust = gtsam.noiseModel.Robust.Create(kernel, noise)
