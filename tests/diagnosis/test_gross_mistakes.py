@@ -16,8 +16,8 @@ from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.landmarks import first_pose_sentence
-from fgloc.diagnosis.setup import check_fit, mirrored, swapped
-from fgloc.diagnosis.setup_fit import EXTRAS, GRID_S, Motion, Picture, Stretch, read_excerpt
+from fgloc.diagnosis.setup import angle_of, check_fit, mirrored, swapped
+from fgloc.diagnosis.setup_fit import EXTRAS, GRID_S, Motion, Picture, Stretch, laid, read_excerpt
 from fgloc.diagnosis.signals import clock_sentence, other_clocks
 from fgloc.diagnosis.truth import truth_sentence
 from fgloc.evaluation.metrics import compute_metrics
@@ -201,6 +201,22 @@ def test_the_motion_of_wheels_and_gyro_fits_poses_on_a_circle_only_if_they_are_t
     for there, close in ((poses, True), (poses * [1.0, 1.0, 1.1], False)):
         residuals = [np.abs(r).max() for r, _, _ in motion.rows(there, extras, 3 * len(times))]
         assert [r < 0.05 for r in residuals] == [close] * len(residuals)
+
+
+def test_a_path_is_laid_onto_the_map_by_the_sightings_that_agree():
+    rng, true = np.random.default_rng(8), np.array([1.0, -2.0, 0.7])
+    path = np.column_stack([np.linspace(0.0, 2.0, 30), np.zeros(30), np.linspace(0.0, 1.0, 30)])
+    seen = np.array([[r * math.cos(a), r * math.sin(a)] for r, a in rng.uniform((1.0, -1.0), (3.0, 1.0), (30, 2))])
+    places = se2.placed(true, se2.placed(path, seen)) + rng.normal(0.0, 0.05, seen.shape)
+    places[::6] += rng.normal(0.0, 2.0, (5, 2))  # of other markers
+    assert np.abs(se2.between(true, laid(path, seen, places))).max() < 0.1
+    assert laid(path[:3], seen[:3], places[:3]) is None
+
+
+def test_a_rotation_matrix_that_is_rounded_has_an_angle():
+    assert angle_of(np.eye(3) * (1.0 + 1e-12)) == 0.0
+    assert angle_of(rpy_matrix(0.0, 0.0, math.pi) * (1.0 + 1e-12)) == pytest.approx(math.pi)
+    assert angle_of(rpy_matrix(0.0, 0.3, 0.0)) == pytest.approx(0.3)
 
 
 def test_wheels_without_noise_are_not_exact():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 import fgloc.estimation.place
 from fgloc import se2
@@ -91,6 +92,16 @@ def test_a_lost_robot_is_not_put_back_to_the_initial_pose():
         assert estimate is not None
         assert estimate.mode is Mode.OK
         assert np.abs(se2.between(truth, estimate.pose)).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "mode"), [((4.0, 0.1, 0.01), Mode.LOST), ((0.1, 0.1, 1.2), Mode.LOST), ((2.0, 2.0, 0.1), Mode.OK)]
+)
+def test_a_robot_is_lost_where_its_place_or_its_yaw_is_hardly_known(sigmas, mode):
+    run = localizer(initial_pose=(0.0, 0.0, 0.0))
+    drive(run, (0.0, 0.0, 0.0), 0, 20)
+    run.estimator.belief.cov = np.diag(np.square(sigmas))
+    assert run.update(step(20, (0.0, 0.0, 0.0), ())).mode is mode
 
 
 def test_a_lost_robot_that_is_found_jumps_there_and_replays_nothing():

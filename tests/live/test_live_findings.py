@@ -83,6 +83,15 @@ def test_however_long_the_robot_stood_it_takes_twenty_seconds_of_motion_at_most(
     assert stands_s < (event.stamp_ns - START_NS) * 1e-9 < stands_s + 20.0
 
 
+def test_each_event_is_compared_once(monkeypatch):
+    add, added = Diagnosis.add, []
+    monkeypatch.setattr(Diagnosis, "add", lambda self, event: (added.append(event), add(self, event))[1])
+    events = swerving(seconds=2.0)
+    with Live(config(), beacons(), roles=("odometry", "sightings")) as live:
+        feed(live, events)
+    assert [(type(e), e.stamp_ns) for e in added] == [(type(e), e.stamp_ns) for e in events]
+
+
 def test_signals_are_compared_once_they_are_many_more_than_before_and_at_the_end():
     diagnosis, due = Diagnosis(config(), beacons(), None, None, None), []
     for event in swerving(seconds=50.0):
