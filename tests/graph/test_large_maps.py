@@ -150,6 +150,20 @@ def test_a_map_that_has_few_landmarks_has_all_as_states():
     assert of_whole_run(estimator.log, factors) is factors
 
 
+@pytest.mark.parametrize(("kind", "made"), [("fixed_lag", IncrementalEstimator), ("ekf", ExtendedKalmanFilter)])
+def test_landmarks_seen_from_a_first_pose_become_states_at_the_next_one(kind, made):
+    landmark_map = corridor(4 * MOST)
+    factors = LandmarkFactors(landmark_map, installation_of(SETTINGS, landmark_map, False, most=MOST))
+    estimator, landmarks = made(EstimatorConfig(kind=kind), factors), factors.installation.landmarks
+    seen = [factors.sighting(k, PointMeasurement(k, 1, math.hypot(1.0, 2.0), -1.1, R), None) for k in range(2)]
+    estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-4), seen[:1])
+    assert estimator.give_states() == (slice(0, 0), [])
+    assert not landmarks
+    estimator.update(10**8, 0.1, [MotionMeasurement("wheels", 0, 1, np.zeros(3), Q)], seen[1:])
+    estimator.give_states()
+    assert landmarks.keys() == {1}
+
+
 def test_a_saved_state_gives_the_landmarks_that_were_states_their_rows_again():
     def fresh():
         landmark_map = corridor(2 * MOST)
