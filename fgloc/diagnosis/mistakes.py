@@ -412,8 +412,7 @@ class Diagnosis:
             self._config = with_values(config, "recording", {"sightings_axes": "optical"})
             self._place = camera.T_base_cam
         sensor = LandmarkSensor(config, landmark_map, camera, T_base_sensor)  # what it refuses does not count
-        place = np.eye(4) if self._place is None else self._place
-        self._corners = SightingCollector(config, landmark_map, sensor, place)
+        self._corners = SightingCollector(config, landmark_map, sensor, np.eye(4))  # corners are in the camera's axes
         self._signals = SignalCollector(config)
         self._began_ns: int | None = None
         self._span_s, self._looked_s, self._compared_s = 0.0, -math.inf, 0.0

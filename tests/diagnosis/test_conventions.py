@@ -224,10 +224,10 @@ def test_a_clock_that_drifts_is_not_late(late, codes):
     [
         (1.0, 0.0, set()),
         (-1.0, 0.0, {"odometry.yaw_sign"}),
-        (180.0 / math.pi, 0.0, {"odometry.yaw_unit"}),
         (1.0, 0.4, {"odometry.twist_late"}),
+        (180.0 / math.pi, 0.0, {"odometry.yaw_unit"}),
     ],
-    ids=["sound", "sign", "degrees", "late"],
+    ids=["sound", "sign", "late", "degrees"],
 )
 def test_a_yaw_rate_is_compared_with_the_odometrys_own_yaw(factor, late_s, codes):
     rates = factor * RATE[np.maximum(np.arange(len(TIMES)) - round(late_s / STEP_S), 0)]

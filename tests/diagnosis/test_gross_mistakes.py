@@ -279,6 +279,13 @@ def test_fault_52_map_shifted_against_the_given_first_pose():
     assert first_pose_sentence(Config(), np.array([2.0, -1.0, 0.0])) is None
 
 
+@pytest.mark.parametrize("coordinate", [0, 1, 2])
+def test_a_given_first_pose_may_be_off_by_its_sigmas_and_a_little(coordinate):
+    config = Config.model_validate({"estimator": {"initial_pose": [0.0, 0.0, 0.0], "initial_sigmas": [0.05] * 3}})
+    for off, is_named in ((0.35, False), (0.45, True)):
+        assert (first_pose_sentence(config, off * np.eye(3)[coordinate]) is not None) == is_named
+
+
 def test_truth_in_another_frame():
     t = np.linspace(0.0, 20.0, 101)
     path = np.column_stack([2.0 * np.sin(0.3 * t), np.cos(0.5 * t), 0.1 * t])

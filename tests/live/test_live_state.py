@@ -200,6 +200,22 @@ def test_values_that_cannot_be_used_are_refused(world, saved, tmp_path, changes,
     assert code != "state.version" or key in read.note
 
 
+@pytest.mark.parametrize("off", [np.diag([-1.0] * 3), np.eye(3, k=1)], ids=["zero", "not symmetric"])
+def test_a_covariance_that_is_none_is_refused(world, saved, tmp_path, off):
+    path = copied(saved, tmp_path)
+    with_content(path, cov=(np.eye(3) + off).tolist())
+    assert read_state(path, fingerprint(world.map)).code == "state.covariance"
+
+
+def test_landmarks_that_were_moved_are_saved(tmp_path):
+    world, path = World(beacons(), seconds=2.0), tmp_path / "state.json"
+    with live_in(world) as live:
+        feed(live, world.events())
+        live._estimation.run.parts.localizer.sightings.modes.displacements[3] = np.array([0.4, -0.1])
+        assert live.save(path)
+    assert read_state(path, fingerprint(world.map)).state.excluded == {3: (0.4, -0.1)}
+
+
 def test_a_state_of_another_map_is_refused(saved):
     read = read_state(saved, fingerprint(beacons()))
     assert (read.state, read.code) == (None, "state.other_map")

@@ -44,6 +44,7 @@ OUTPUTS = {
     "/fgloc/pose": POSE,
     "/tf": "tf2_msgs/msg/TFMessage",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/fgloc/protection": "geometry_msgs/msg/Vector3Stamped",
 }
 
 
@@ -232,7 +233,7 @@ def test_two_publishers_of_one_topic_are_told_apart():
     assert 30 < dropped < 60  # as long as the first might still come
 
 
-def test_an_odometry_that_is_late_has_its_frame_on_tf():
+def test_an_odometry_that_is_late_has_its_frame_on_tf_and_bounds_and_state_beside_it():
     """Its stamps are 0.4 s behind the clock; the poses that are kept reach back 0.125 s."""
     topics = {"image": "none", "sightings": "none"}
     config = Config.model_validate({"recording": {"topics": topics}, "estimator": {"initial_pose": (5.0, 2.0, 0.0)}})
@@ -254,6 +255,9 @@ def test_an_odometry_that_is_late_has_its_frame_on_tf():
     t = last.transform.translation
     assert (last.header.frame_id, last.child_frame_id) == ("map", "odom")
     assert (t.x, t.y) == pytest.approx((5.0, 2.0), abs=0.1)
+    bound = session.heard["/fgloc/protection"][-1][1].vector
+    assert 0.0 < bound.x < 10.0
+    assert {status.level for _, message in session.heard["/diagnostics"] for status in message.status}
 
 
 def test_ambiguous_topics_are_an_error_and_missing_ones_are_waited_for():
