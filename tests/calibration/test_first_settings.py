@@ -15,14 +15,14 @@ from fgloc_datasets.bag import BagWriter
 START_NS, BEAMS, DARK, BRIGHT = 1_700_000_000_000_000_000, 360, 100.0, 900.0
 
 
-def settings(folder, has_map=True):
+def settings(folder, has_map=True, sign=1.0):
     """Of a robot that winds along for 6 s among reflectors."""
     rng = np.random.default_rng(2)
     with BagWriter(folder / "bag") as bag:
         bag.static_transform(START_NS, "base_link", "laser", (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0))
         for k in range(120):
             stamp, yaw = START_NS + k * 50_000_000, 0.3 * math.sin(0.05 * k)
-            bag.odometry("/odom", stamp, (0.02 * k, 0.0, yaw), (0.4, 0.3 * math.cos(0.05 * k)))
+            bag.odometry("/odom", stamp, (0.02 * k, 0.0, yaw), (0.4, sign * 0.3 * math.cos(0.05 * k)))
             if k % 4 == 0:
                 intensities = rng.uniform(0.5 * DARK, DARK, BEAMS)
                 intensities[[40, 100, 200, 270]] = BRIGHT
@@ -42,3 +42,8 @@ def test_an_odometry_that_nobody_calibrated_has_wider_priors_where_a_map_can_tel
     wheels, usual = settings(tmp_path, has_map).wheels, Config().wheels
     assert (wheels.scale_sigma > usual.scale_sigma) == has_map
     assert (wheels.turn_scale_sigma > usual.turn_scale_sigma) == has_map
+
+
+@pytest.mark.parametrize(("sign", "source"), [(1.0, Config().wheels.source), (-1.0, "pose")])
+def test_a_yaw_rate_with_the_wrong_sign_is_not_used(tmp_path, sign, source):
+    assert settings(tmp_path, sign=sign).wheels.source == source

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from fgloc import cli, se2
@@ -16,8 +17,8 @@ from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.landmarks import first_pose_sentence
-from fgloc.diagnosis.setup import angle_of, check_fit, mirrored, swapped
-from fgloc.diagnosis.setup_fit import EXTRAS, GRID_S, Motion, Picture, Stretch, laid, read_excerpt
+from fgloc.diagnosis.setup import Change, angle_of, check_fit, correction, mirrored, swapped
+from fgloc.diagnosis.setup_fit import EXTRAS, GRID_S, Motion, Picture, Setup, Stretch, laid, read_excerpt
 from fgloc.diagnosis.signals import clock_sentence, other_clocks
 from fgloc.diagnosis.truth import truth_sentence
 from fgloc.evaluation.metrics import compute_metrics
@@ -203,6 +204,17 @@ def test_the_motion_of_wheels_and_gyro_fits_poses_on_a_circle_only_if_they_are_t
         assert [r < 0.05 for r in residuals] == [close] * len(residuals)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [("yaw_per_m", 0.1, (1.0, 0.0, 0.1)), ("radius", 0.1, (math.exp(0.1), 0.0, 0.0)), ("track", 0.1, (1.0, 0.0, 0.0))],
+)
+def test_what_wheels_may_be_off_by_changes_their_motion(name, value, expected):
+    stretch = Stretch(np.array([0.5, 1.5]), (), np.tile([0.02, 0.0, 0.0], (100, 1)), None, START_NS)
+    extras = np.where(np.array(EXTRAS) == name, value, 0.0)
+    went, _, _ = Motion([stretch], np.eye(3), Config()).between(extras)
+    np.testing.assert_allclose(went[0], se2.exp(np.array(expected)), atol=1e-3)
+
+
 def test_a_path_is_laid_onto_the_map_by_the_sightings_that_agree():
     rng, true = np.random.default_rng(8), np.array([1.0, -2.0, 0.7])
     path = np.column_stack([np.linspace(0.0, 2.0, 30), np.zeros(30), np.linspace(0.0, 1.0, 30)])
@@ -225,6 +237,24 @@ def test_wheels_without_noise_are_not_exact():
     stretch = Stretch(np.array([0.5, 1.5]), (), np.tile([0.02, 0.0, 0.03], (100, 1)), None, START_NS)
     _, sigmas, _ = Motion([stretch], np.eye(3), config).between(np.zeros(len(EXTRAS)))
     assert (sigmas > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "lines", "value"),
+    [
+        ("radius", {"wheels.scale_v": 1.1, "wheels.scale_omega": 1.1}, 1.1),
+        ("track", {"wheels.scale_omega": 1.0 / 1.1}, 1.1),
+        ("odometry_frame", {"wheels.source": "pose"}, None),
+    ],
+)
+def test_a_mistake_of_the_odometer_has_its_lines_and_its_factor(kind, lines, value):
+    extras = np.where(np.array(EXTRAS) == kind, math.log(1.1), 0.0)
+    setup = Setup(Config(), LandmarkMap({}), None, extras=extras)
+    found = correction(Change(kind, setup), setup, "odometry", "image", "odometry").finding
+    assert {key.removeprefix("expert."): yaml.safe_load(text) for key, text in found.lines.items()} == {
+        key: pytest.approx(number, abs=1e-4) if isinstance(number, float) else number for key, number in lines.items()
+    }
+    assert found.value == (None if value is None else pytest.approx(value))
 
 
 # --- by the messages alone ---

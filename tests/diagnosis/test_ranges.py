@@ -10,6 +10,8 @@ from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import config_of, config_of_file
 from fgloc.diagnosis.mistakes import find_mistakes
+from fgloc.diagnosis.ranges import fit_ranges
+from fgloc.diagnosis.signals import Path
 from fgloc.sensors.maps import write_map
 from fgloc.types import Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
@@ -47,6 +49,27 @@ def first(bag):
     """Codes of what `init` finds, and the settings that it writes."""
     made = first_settings(bag)
     return {finding.code for finding in made.found}, config_of_file(yaml.safe_load(made.text))
+
+
+@pytest.mark.parametrize("turn", [2.0, 1.0])
+def test_the_turn_of_a_robot_over_its_wheels_is_found_by_ranges(turn):
+    t, rng = np.arange(0.0, 22.0, 0.05), np.random.default_rng(4)
+    omega = 0.9 * np.sin(0.6 * t) + 0.35
+    poses, by_wheels = [np.array([1.0, 1.0, 0.2])], [np.zeros(3)]
+    for w in omega[:-1]:
+        poses.append(se2.compose(poses[-1], se2.exp(0.05 * np.array([SPEED, 0.0, w]))))
+        x, y, _ = se2.compose((*by_wheels[-1][:2], se2.wrap(by_wheels[-1][2])), se2.exp((0.02, 0.0, 0.05 * w / turn)))
+        by_wheels.append(np.array([x, y, by_wheels[-1][2] + 0.05 * w / turn]))
+    rows = [
+        (s, 1 + k % 4, math.dist((*p[:2], 0.0), PLACES[1 + k % 4]))
+        for k, (s, p) in enumerate(zip(t, poses, strict=True))
+    ]
+    rows = [(s, i, r + rng.normal(0.0, NOISE_M)) for s, i, r in rows[::5]]
+    anchors = {i: np.array(place) for i, place in PLACES.items()}
+    path = Path(t, np.array(by_wheels), np.zeros(len(t), dtype=np.int64), "odometry")
+    fit = fit_ranges(path, rows, anchors, np.zeros(3), NOISE_M)
+    assert fit.turn.value == pytest.approx(turn, rel=0.05)
+    assert fit.misfit < 2.0 * NOISE_M
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,13 @@ def test_without_a_map_the_wheels_are_the_measure_of_length():
     assert codes(judged(track, estimates(track, poses * [1.11, 1.11, 1.0]))) == ["sanity.odometry"]
 
 
+@pytest.mark.parametrize(("sigma", "code"), [(0.01, "sanity.odometry"), (0.05, "sanity.unsure")])
+def test_wheels_that_are_hardly_known_are_no_measure_of_length(sigma, code):
+    poses, motions, rng = driven()
+    track = dataclasses.replace(track_of(poses, motions, rng, known=False), scale_sigma=sigma)
+    assert codes(judged(track, estimates(track, poses * [1.06, 1.06, 1.0]))) == [code]
+
+
 def test_poses_that_are_not_finite_are_not_given():
     poses, motions, rng = driven()
     track = track_of(poses, motions, rng, ids=())

@@ -96,6 +96,12 @@ def test_sightings_of_one_beacon_within_its_correlation_time_share_their_informa
     assert [d.weight for d in (*first, *later)] == pytest.approx([1.0, weight])
 
 
+def test_sightings_that_cannot_be_fused_agree_with_none(monkeypatch):
+    monkeypatch.setattr(association, "correct", lambda *_: None)
+    (rows,) = judged(ROW, image(ROW, (1, 1), (2, 2), (3, 3)), sigmas=UNSURE)
+    assert [d.landmark_id for d in rows] == [1, 2, 3]
+
+
 def test_the_work_for_a_burst_of_sightings_is_bounded(monkeypatch):
     """After a stall a step holds the images of seconds; an unsure pose excludes none of them, and one was misread."""
     corrections, correct = [], association.correct

@@ -57,8 +57,8 @@ class Beacons:
         )
 
 
-def localizer(**estimator) -> Localizer:
-    settings = Config.model_validate({"estimator": estimator})
+def localizer(adaptive: bool = True, **estimator) -> Localizer:
+    settings = Config.model_validate({"estimator": estimator, "weights": {"adaptive": adaptive}})
     return Localizer(settings, MAP, MotionSensors(Wheels()), PoseSensors(Beacons()))
 
 
@@ -111,6 +111,16 @@ def test_a_lost_robot_that_is_found_jumps_there_and_replays_nothing():
     found = [e for _, e in drive(run, (2.0, 1.0, 2.0), 20, 20) if e is not None]
     assert [d.reason for e in found for d in e.decisions if d.kind == "place"] == ["jump"]
     assert run.estimator.k == 39
+
+
+@pytest.mark.parametrize(("adaptive", "reasons"), [(True, {""}), (False, {"gate"})])
+def test_several_beacons_that_agree_on_a_place_nearby_overrule_the_wheels(adaptive, reasons):
+    run = localizer(adaptive, initial_pose=(0.0, 0.0, 0.0))
+    drive(run, (0.0, 0.0, 0.0), 0, 20)
+    aside = np.array([0.6, -0.1, 0.1])  # by a slip of one step
+    told = run.update(step(20, aside, (0, 1, 2)))
+    assert {d.reason for d in told.decisions if d.landmark_id >= 0} == reasons
+    assert (np.abs(se2.between(aside, told.pose)).max() < 0.01) == adaptive
 
 
 def test_the_steps_before_the_first_pose_are_replayed_from_it():

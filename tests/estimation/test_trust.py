@@ -261,10 +261,11 @@ def test_known_failures_are_believed_in_their_intervals_alone():
     assert not any(reason != "distrusted" for t in found for reason in t.budget.rejected.values())
 
 
-def test_a_new_segment_begins_without_a_flag():
+@pytest.mark.parametrize("begins", [lambda trust: trust.reset(), lambda trust: trust.begin(Step(20, 1, 0, 1))])
+def test_a_new_segment_begins_without_a_flag(begins):
     trust = trust_in()
     assert run(trust, 20, sides(0.0, RIGHT))[-1].budget.rejected
-    trust.reset()
+    begins(trust)
     assert not any(t.budget.rejected for t in run(trust, 20, (SPEED, TURN), first=20))
 
 

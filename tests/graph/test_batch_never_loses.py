@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from robot_world import SPEED, START_NS, TURN, World, beacons, config, truth_at
+from robot_world import SPEED, START_NS, TURN, Chain, World, beacons, config, truth_at
 from world_bags import write_world
 
 from fgloc import se2
+from fgloc.config import BatchConfig
+from fgloc.graph.batch import BatchSmoother
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.range_bearing import RangeBearingEvent
@@ -19,6 +21,23 @@ from fgloc_datasets.bag import BagWriter
 
 MODES = ("batch", "online")
 STEP_NS = 20_000_000
+
+
+def test_without_a_map_likely_sightings_are_kept_and_their_landmarks_are_found():
+    world = World(beacons(), seconds=6.0, rate=5)
+    chain = Chain(config(estimator={"kind": "isam2"}), None, keep_all=True)
+    start = chain.run(world.events())[0]
+    estimator, factors = chain.localizer.estimator, chain.localizer.factors
+    solver = BatchSmoother(estimator.log, factors, BatchConfig(), 0.9999)
+    seen = sum(len(frame.sightings) for frame in solver.frames)
+    assert 0.9 * seen < sum(map(len, solver.accepted.values())) <= seen
+    T = se2.compose(start.pose, se2.inverse(world.truth(start.stamp_ns)))
+    landmarks = solver.result().landmarks
+    assert landmarks.keys() == world.map.landmarks.keys()
+    off = [
+        np.hypot(*(m.position[:2] - se2.placed(T, world.map.landmarks[i].position[:2]))) for i, m in landmarks.items()
+    ]
+    assert max(off) < 0.2
 
 
 def finite(result) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from robot_world import Chain, World, config, position_error, room
 from test_observation import scene
 
 from fgloc import se2
@@ -252,3 +253,13 @@ def test_quaternions_of_roll_pitch_and_yaw() -> None:
     np.testing.assert_allclose(
         quaternion_matrix(rpy_quaternion(0.1, -0.2, 2.0)), rpy_matrix(0.1, -0.2, 2.0), atol=1e-12
     )
+
+
+@pytest.mark.parametrize("kind", ["fixed_lag", "isam2", "ekf"])
+def test_a_flat_floor_that_may_be_uneven_gives_the_same_place(kind) -> None:
+    world = World(room(), seconds=4.0, rate=5)
+    chain = Chain(config(estimator={"ground": "uneven", "kind": kind}), world.map)
+    estimates = chain.run(world.events())
+    assert len(estimates) > 15
+    assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates[3:]) < 0.05
+    assert all(abs(e.ground.z) < 0.1 for e in estimates[3:])

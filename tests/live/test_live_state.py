@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from live_feed import ROLES, errors, feed, live_in
 from robot_world import START_NS, World, beacons, config, nees, room
+from wire import wait_until
 
 from fgloc.errors import OutputError
 from fgloc.live import Live
@@ -214,6 +215,14 @@ def test_landmarks_that_were_moved_are_saved(tmp_path):
         live._estimation.run.parts.localizer.sightings.modes.displacements[3] = np.array([0.4, -0.1])
         assert live.save(path)
     assert read_state(path, fingerprint(world.map)).state.excluded == {3: (0.4, -0.1)}
+
+
+def test_the_state_is_saved_while_the_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("fgloc.live.engine._SAVE_EVERY_S", 0.05)
+    world, path = World(beacons(), seconds=2.0), tmp_path / "state.json"
+    with live_in(world, state=path) as live:
+        feed(live, world.events())
+        assert wait_until(path.exists, 10.0)
 
 
 def test_a_state_of_another_map_is_refused(saved):
