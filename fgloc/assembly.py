@@ -100,12 +100,13 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
     config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
     learned, cameras = setup.learned, setup.cameras
     joint = learned.model.joint if learned is not None and config.motion.correlation == "joint" else None
-    wheels = WheelMotion(config.wheels)
+    wheels = WheelMotion(config.wheels.model_copy(update={"source": "none"}) if setup.unmeasured else config.wheels)
     gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
     watched_gyro = None if setup.imu_up is None else Gyro(config.gyro, setup.imu_up)
     attitude = None if setup.T_base_imu is None else Attitude(config.gyro, setup.T_base_imu)
     flat = config.estimator.ground == "flat"
-    motion = MotionSensors(wheels, learned, joint, gyro, None if flat else attitude, not setup.sees, setup.beside)
+    tilt = None if flat else attitude
+    motion = MotionSensors(wheels, learned, joint, gyro, tilt, not setup.sees, setup.beside, setup.unmeasured)
     landmarks = LandmarkSensor(config, landmark_map, cameras, setup.T_base_sensor)
     seen = LandmarkSensor(config, landmark_map, cameras, setup.T_base_sensor)  # what it refuses does not count
     floor = FloorWatch(attitude, wheels, seen, landmark_map) if flat else None

@@ -186,6 +186,7 @@ class SensorSetup:
         sensors: those of other packages.
         notes: what the user should know.
         sees: whether anything in the stream can tell where the robot is.
+        unmeasured: whether sightings alone tell how it moves.
         beside: odometries beside the wheels.
     """
 
@@ -201,6 +202,7 @@ class SensorSetup:
     notes: tuple[str, ...]
     sees: bool
     beside: tuple[BesideOdometry, ...] = ()
+    unmeasured: bool = False
 
 
 def recorded_setup(
@@ -230,7 +232,14 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
     """The sensors of a stream of which these facts are known; otherwise as `recorded_setup`."""
     _need_motion(facts)
     notes = list(landmark_map.notes) if landmark_map is not None else []
-    if not {"odometry", "joints", "command"} & set(facts.roles):
+    there = [one for one in config.recording.odometries if one.role in facts.roles]
+    unmeasured = not there and not {*_WHEELS, "imu"} & set(facts.roles)
+    if unmeasured:
+        notes.append(
+            "Nothing but sightings tells how the robot moves (no odometry, joint states, commands or IMU): between "
+            "them its speed is taken to stay as it was for about two seconds."
+        )
+    elif not _WHEELS & set(facts.roles):
         notes.append(
             "No odometry, joint states or commands: between sightings the robot may have gone as far as a fifth of "
             "expert.gate.max_speed takes it."
@@ -262,7 +271,6 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
         imu_up = mounted_up(facts, config, facts.first)
         T_base_imu = mounted_imu(facts, config, facts.first)
     sees = bool(sensors) or not {"image", "sightings"}.isdisjoint(kinds)
-    there = [one for one in config.recording.odometries if one.role in facts.roles]
     beside = tuple(BesideOdometry(one, config.gate, _frames(facts, config)) for one in there)
     return SensorSetup(
         config,
@@ -277,6 +285,7 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
         tuple(notes),
         sees,
         beside,
+        unmeasured,
     )
 
 
@@ -293,11 +302,15 @@ def _without_effect(config: Config, section: str, camera: str) -> Iterator[str]:
         )
 
 
+_WHEELS: frozenset[Role] = frozenset({"odometry", "joints", "command"})
+
+
 def _need_motion(facts: StreamFacts) -> None:
-    if not {"odometry", "joints", "command", "imu"} & set(facts.roles):
+    """Refuse a stream in which nothing tells of motion; sightings alone do, where there are no wheels."""
+    if not {"odometry", "joints", "command", "imu", "image", "sightings"} & base_roles(facts.roles):
         raise RecordingError(
-            f"{facts.name}: no odometry, joint states or commands, and no IMU; a run needs one of them. Topics: "
-            f"{facts.topics}"
+            f"{facts.name}: no odometry, joint states or commands, no IMU and no images or sightings; a run needs one "
+            f"of them. Topics: {facts.topics}"
         )
 
 

@@ -660,6 +660,7 @@ class SurveyGraph:
 
 _KNOWN_M, _KNOWN_RAD = 0.1, 0.2  # sigmas of a marker that is not known yet
 _CONTRADICTS = 4.0  # sigmas by which a measured distance may miss
+_MOVED = 6.0  # sigmas by which a given marker may be moved
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -672,6 +673,7 @@ class Survey:
         left_out: markers that were seen but are not in the map, with the reason.
         installation: what was found besides, by name.
         notes: what the user should know, one sentence each.
+        errors: sentences on what was given and cannot be true: the map is not to be trusted.
     """
 
     landmarks: LandmarkMap
@@ -679,6 +681,7 @@ class Survey:
     left_out: Mapping[int, str]
     installation: Found
     notes: tuple[str, ...]
+    errors: tuple[str, ...] = ()
 
 
 def survey(
@@ -701,6 +704,11 @@ def survey(
     Raises:
         FglocError: a recording cannot be used, nothing is seen often enough, or recordings have no marker in common.
     """
+    if config.estimator.ground != "flat":
+        raise ConfigError(
+            f"estimator.ground: {config.estimator.ground}: markers are surveyed on a flat floor; drive where it is "
+            "flat and set estimator.ground: flat for the survey"
+        )
     drives = [drive(bag, config, progress) for bag in bags]
     anchors = {i: m for i, m in (given.landmarks if given is not None else {}).items() if m.size_m > 0.0}
     seen = Counter({i: n for one in drives for i, n in one.sightings.items()})
@@ -725,7 +733,25 @@ def survey(
     notes += [f"Markers {sorted(unseen)} of the given map were not seen, and stay as given."] if unseen else []
     misfits = [(d, graph.misfit(d)) for d in distances]
     notes += [_missed(d, sigmas) for d, sigmas in misfits if sigmas > _CONTRADICTS]
-    return Survey(landmarks, {i: views[i] for i in kept}, left_out, found, tuple(dict.fromkeys(notes)))
+    errors = [text for i in sorted(anchors) if i in kept and (text := _moved(graph, i)) is not None]
+    views_kept = {i: views[i] for i in kept}
+    return Survey(landmarks, views_kept, left_out, found, tuple(dict.fromkeys(notes)), tuple(errors))
+
+
+def _moved(graph: SurveyGraph, marker: int) -> str | None:
+    """Sentence on a given marker that the sightings put elsewhere than its sigmas allow; None: they do not."""
+    first, count = graph.installation.landmarks[marker]
+    part = slice(first, first + count)
+    move, sigmas = graph.belief.mean[part], np.maximum(graph.installation.sigmas[part], 1e-9)
+    most = float((np.abs(move) / sigmas).max())
+    if most <= _MOVED:
+        return None
+    turned = math.degrees(float(np.linalg.norm(move[3:])))
+    return (
+        f"marker {marker} was given {np.linalg.norm(move[:3]):.2f} m and {turned:.0f}° from where the sightings have "
+        f"it, {most:.0f} σ: its place, the size of a marker, the camera's calibration or mounting is wrong, or the "
+        "floor is not flat"
+    )
 
 
 def _need_ends(distances: Sequence[Distance], start: Mapping[int, Landmark], left_out: Mapping[int, str]) -> None:

@@ -166,6 +166,10 @@ def make_map(
         found = survey(bags, settings, given, distances, progress)
     write_map(found.landmarks, out)
     _tell(found, out)
+    if found.errors:
+        for text in found.errors:
+            say_remark("error", text, err=True)
+        raise typer.Exit(EXIT_LOST)
     _tell_next(bags, out, config)
 
 

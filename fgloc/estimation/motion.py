@@ -104,6 +104,58 @@ class TurnComparison:
         return replace(turned, yaw=turned.yaw - change * seconds, variance=turned.noise + drift)
 
 
+_STEADY_S = 2.0  # time constant of a speed that nothing measures
+_FOLLOWED_S = 1.0  # between two fixes that tell the speed
+
+
+class SteadyMotion:
+    """Predicts the motion of a robot, or of a camera, that no source measures, by its speed at the last fixes.
+
+    The speed is a first-order Gauss-Markov process: it stays for `_STEADY_S`, and then is what any speed may be.
+
+    Source: Singer 1970, "Estimating optimal tracking filter performance for manned maneuvering targets", for speeds.
+    """
+
+    def __init__(self, sigmas: FloatArray) -> None:
+        """Set the standard deviations ``(3,)`` of a speed of which nothing is known [m/s, m/s, rad/s]."""
+        self._any = np.square(sigmas)
+        self.begin_segment()
+
+    def begin_segment(self) -> None:
+        """Forget speed and place."""
+        self._twist, self._variance = np.zeros(3), self._any
+        self._fix: PoseWithCovariance | None = None
+        self._fixed_ns = 0
+
+    def predict(self, start_ns: int, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Motion ``(3,)`` between two times, and its covariance ``(3, 3)``."""
+        if self._fix is None:
+            return np.zeros(3), np.diag(self._any) * ((stamp_ns - start_ns) * 1e-9) ** 2
+        before, after = (max(t - self._fixed_ns, 0) * 1e-9 for t in (start_ns, stamp_ns))
+        stays = _STEADY_S * (math.exp(-before / _STEADY_S) - math.exp(-after / _STEADY_S))
+        return self._twist * stays, np.diag(self._gone(after) - self._gone(before))
+
+    def _gone(self, seconds: float) -> FloatArray:
+        """Variance ``(3,)`` of the way since the last fix."""
+        t = min(seconds, _STEADY_S)
+        density = 2.0 * self._any / _STEADY_S
+        return np.asarray(self._variance * t**2 + density * t**3 / 3.0 + density * _STEADY_S**2 * (seconds - t))
+
+    def fix(self, belief: PoseWithCovariance, stamp_ns: int) -> None:
+        """Update the speed by a pose that sightings have fixed."""
+        last, seconds = self._fix, (stamp_ns - self._fixed_ns) * 1e-9
+        self._fix, self._fixed_ns = belief, stamp_ns
+        if last is None or not 0.0 < seconds < _FOLLOWED_S:
+            self._twist, self._variance = np.zeros(3), self._any
+            return
+        kept = math.exp(-seconds / _STEADY_S)
+        expected, variance = kept * self._twist, kept**2 * self._variance + (1.0 - kept**2) * self._any
+        went = se2.log(se2.between(last.pose, belief.pose)) / seconds
+        noise = (np.diag(last.cov) + np.diag(belief.cov)) / seconds**2
+        gain = variance / (variance + noise)
+        self._twist, self._variance = expected + gain * (went - expected), (1.0 - gain) * variance
+
+
 class MotionSources:
     """Reads wheels, learned motion and gyro, and follows what is known of their drift."""
 
@@ -116,8 +168,9 @@ class MotionSources:
             factors: hold what is known of the installation; None: motions are taken as they are reported.
         """
         self._config = config
-        # Sigma of a speed that is not measured, as a share of the gate's bound: the bound is the quantile of GATE
-        self._likely = 1.0 / math.sqrt(chi2_bound(GATE, 1))
+        # Sigmas of a speed that is not measured: the gate's bound is the quantile of GATE
+        speed, turn = config.gate.max_speed, config.gate.max_yaw_rate
+        self._widest = 1.0 / math.sqrt(chi2_bound(GATE, 1)) * np.array([speed, speed, turn])
         self.factors = LandmarkFactors(None) if factors is None else factors
         # m²/s of wheels that stand, with the way of encoders that jitter; of silent ones it is hundreds of times more
         self._known_rest = 10.0 * config.wheels.noise.xy_per_sqrt_s**2
@@ -126,8 +179,14 @@ class MotionSources:
         self.beside: OdometriesBeside | None = None  # set by the judge, which compares them
         self._alone = TurnComparison(config) if sensors.alone and sensors.gyro is not None else None
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
+        self._steady = SteadyMotion(self._widest) if sensors.unmeasured else None
         self._yaw_indirect_s = 0.0  # how far back the yaw rests on the gyro, where fixes observe it along the way only
         self._silent_s = 0.0  # how long there was neither a motion source nor a fix
+
+    @property
+    def unmeasured(self) -> bool:
+        """Whether there is no source at all."""
+        return self._steady is not None
 
     @property
     def rules(self) -> FusionRules:
@@ -136,8 +195,8 @@ class MotionSources:
             wheels_are_commands=self._wheels.from_commands,
             learned_has_gyro=self._learned_has_gyro,
             joint=self._joint,
-            stopped_speed=self._likely * self._config.gate.max_speed,
-            stopped_turn=self._likely * self._config.gate.max_yaw_rate,
+            stopped_speed=float(self._widest[0]),
+            stopped_turn=float(self._widest[2]),
             turns_by_gyro=self._alone is not None and not self._wheels.from_commands,
         )
 
@@ -271,26 +330,31 @@ class MotionSources:
         after = before + step.dt
         if carried_s is None:
             self._silent_s = after
-        gate = self._config.gate
-        speed, turn = self._likely * gate.max_speed, self._likely * gate.max_yaw_rate
-        cov = np.diag(np.square([speed, speed, turn])) * (after**2 - before**2)
-        motion, gyro = np.zeros(3), None if readings is None else readings.gyro
+        motion, cov = np.zeros(3), np.diag(np.square(self._widest)) * (after**2 - before**2)
+        if self._steady is not None and carried_s is None:
+            motion, cov = self._steady.predict(step.start_ns, step.stamp_ns)
+        gyro = None if readings is None else readings.gyro
         if gyro is not None:
             motion, cov[2, 2] = with_yaw(motion, float(gyro.motion[2])), gyro.cov[2, 2]
         inertial = None if readings is None else readings.inertial
         return MotionMeasurement("unknown", step.start_ns, step.stamp_ns, motion, cov, inertial=inertial)
 
-    def commit(self, readings: MotionReadings, fix: PoseWithCovariance | None, observes_yaw: bool = True) -> None:
+    def commit(
+        self, readings: MotionReadings, fix: PoseWithCovariance | None, stamp_ns: int, observes_yaw: bool = True
+    ) -> None:
         """Update bias and drift of the sources after a step.
 
         Args:
             readings: of that step.
+            stamp_ns: of its end.
             fix: where sightings have it now; None if there were none.
             observes_yaw: whether one of them observes the yaw by itself. Positions and ranges do along the way: the yaw
                 of a fix then rests on the gyro too, and only two fixes far apart correct its bias.
         """
         if fix is not None:
             self._silent_s = 0.0
+            if self._steady is not None:
+                self._steady.fix(fix, stamp_ns)
         if self.gyro is None:
             return
         if readings.gyro is None:
@@ -328,6 +392,8 @@ class MotionSources:
     def begin_segment(self) -> None:
         """Forget the last fix, as nothing is known of the motion during a jump of the clock."""
         self._silent_s = self._yaw_indirect_s = 0.0
+        if self._steady is not None:
+            self._steady.begin_segment()
         if self.beside is not None:
             self.beside.begin_segment()
         if self.gyro is not None:
@@ -805,7 +871,7 @@ class MotionJudge:
             factors = tuple(self.combine(step, readings, budget))
         if self._lift.carried:
             return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)
-        if factors[0].source == "unknown":
+        if factors[0].source == "unknown" and not self.sources.unmeasured:
             self.rejections["motion.silent"] += 1
         return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
 
@@ -857,7 +923,7 @@ class MotionJudge:
             self.record_fix()
             for drift in self._drifts or ():
                 drift.fix(fix)
-        self.sources.commit(motion.readings, fix, observes_yaw)
+        self.sources.commit(motion.readings, fix, motion.factors[0].stamp_ns, observes_yaw)
 
     def record_fix(self) -> None:
         """Note that sightings, or a given pose, have fixed where the robot is."""

@@ -122,6 +122,7 @@ class MotionSensors:
         attitude: roll and pitch, on uneven ground; None: it is flat, or nothing measures them.
         alone: nothing in the stream can tell where the robot is.
         beside: odometries beside the wheels.
+        unmeasured: none of these has a topic in the stream: sightings alone show how the robot moves.
     """
 
     wheels: WheelMotion
@@ -131,6 +132,7 @@ class MotionSensors:
     attitude: Attitude | None = None
     alone: bool = False
     beside: Sequence[BesideOdometry] = ()
+    unmeasured: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

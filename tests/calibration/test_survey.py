@@ -134,6 +134,39 @@ def test_given_markers_make_the_frame_and_are_refined(bag):
     assert np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 0.03
     assert np.mean(np.abs(off) < 3.0 * sigma) > 0.95
     assert all(np.trace(seen.landmarks[i].cov) < np.trace(m.cov) for i, m in given.items() if i != 40)
+    assert not made.errors
+
+
+def test_given_markers_that_cannot_be_where_they_are_said_to_be_are_named(bag, tmp_path):
+    given = part({0, 4, 9, 16}).landmarks
+    wrong = {**given, 4: dataclasses.replace(given[4], position=given[4].position + np.array([0.0, 0.3, 0.0]))}
+    write_map(LandmarkMap(wrong, "DICT_4X4_50"), tmp_path / "given.yaml")
+    out = tmp_path / "map.yaml"
+    done = CliRunner().invoke(app, ["map", str(bag), "--anchor", str(tmp_path / "given.yaml"), "--out", str(out)])
+    assert done.exit_code == 3, done.output
+    assert "marker 4 " in done.output
+    assert out.exists()
+
+
+def test_sightings_alone_survey_and_locate(bag, tmp_path):
+    """No wheels, no commands, no IMU: the robot's speed stays as it was for a while."""
+    silent = dict.fromkeys(("odometry", "joints", "command", "imu"), "none")
+    alone = settings(recording={"topics": silent}, truth={"align": "none"})
+    made = survey([bag], alone, part({0, 4, 9, 16}))
+    assert set(made.landmarks.landmarks) == set(room().landmarks)
+    off, sigma = errors(made.landmarks, np.zeros(3))
+    assert np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 0.06
+    assert np.mean(np.abs(off) < 3.0 * sigma) > 0.95
+    write_map(room(), tmp_path / "map.yaml")
+    for mode in ("batch", "online"):
+        result = run(bag, tmp_path / "map.yaml", alone, mode)
+        assert match_result(result, alone).distances.mean() < 0.03
+        assert not any("motion" in name for name in result.rejections)
+
+
+def test_a_survey_on_uneven_ground_is_refused(bag):
+    with pytest.raises(ConfigError, match="uneven"):
+        survey([bag], settings(estimator={"ground": "uneven"}))
 
 
 def test_a_measured_distance_sets_the_scale(bag, found):
