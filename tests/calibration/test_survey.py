@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 from world_bags import write_world
 
-from fgloc.calibration.survey import Distance, aligned, mirrored, moved_by, planar_matrix, survey
+from fgloc.calibration.survey import Distance, SurveyGraph, aligned, mirrored, moved_by, planar_matrix, survey
 from fgloc.cli import app
 from fgloc.errors import ConfigError, MapError, RecordingError
 from fgloc.evaluation.metrics import match_result
+from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.installation import MARKER, Installation
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
@@ -187,6 +188,25 @@ def test_a_distance_that_does_not_fit_is_told(tmp_path):
     true = float(np.linalg.norm(known[first].position - known[second].position))
     made = survey([bag], settings(), distances=[Distance(first, second, 1.1 * true)])
     assert any(re.search(r"markers' size\b", note) for note in made.notes)
+
+
+def test_markers_are_solved_again_from_where_they_were_found_until_they_stay_and_no_longer(tmp_path, monkeypatch):
+    solved, moves, solve = [], [], SurveyGraph.solve
+
+    class Counted(BatchSmoother):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            solved.append(self)
+
+    def observed(self):
+        solve(self)
+        moves.extend(np.abs(self.belief.mean[k : k + 6]) for k, _ in self.installation.landmarks.values())
+
+    monkeypatch.setattr("fgloc.calibration.survey.BatchSmoother", Counted)
+    monkeypatch.setattr(SurveyGraph, "solve", observed)
+    survey([write_world(tmp_path, World(room(), seed=4, seconds=4.0, rate=5))], settings())
+    assert len(solved) < 6
+    assert (np.max(moves, axis=0) < [1e-3] * 3 + [5e-3] * 3).all()
 
 
 def test_a_distance_to_a_marker_that_was_not_seen_is_refused(bag):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from robot_world import Chain, World, config, room
 from scipy.stats import norm
 
 from fgloc import se2
@@ -205,6 +206,15 @@ def test_in_the_dark_a_slip_may_go_unseen_and_less_of_it_between_two_sources():
     assert dark.cause == "slip"
     assert fixed.position_m < checked.position_m < dark.position_m
     assert bound(since_fix_s=5.0, speed=REST).position_m == pytest.approx(fixed.position_m, rel=0.01)
+
+
+def test_where_wheels_have_slipped_in_this_run_the_dark_is_bounded_more_widely():
+    world, bounds = World(room(), seconds=6.0, rate=5, blind=((3.0, 6.0),)), []
+    for slips in (0, 20):
+        chain = Chain(config(), world.map)
+        chain.localizer.motion._faults.flags["wheels.slip"] = slips
+        bounds.append([e.protection.position_m for e in chain.run(world.events())[-8:]])
+    assert (np.array(bounds[1]) > np.array(bounds[0])).all()
 
 
 def test_soon_after_a_fix_a_slip_has_made_no_more_than_the_way_since_then():
