@@ -733,25 +733,32 @@ def survey(
     notes += [f"Markers {sorted(unseen)} of the given map were not seen, and stay as given."] if unseen else []
     misfits = [(d, graph.misfit(d)) for d in distances]
     notes += [_missed(d, sigmas) for d, sigmas in misfits if sigmas > _CONTRADICTS]
-    errors = [text for i in sorted(anchors) if i in kept and (text := _moved(graph, i)) is not None]
-    views_kept = {i: views[i] for i in kept}
-    return Survey(landmarks, views_kept, left_out, found, tuple(dict.fromkeys(notes)), tuple(errors))
+    errors = tuple(_moved(graph, sorted(anchors & kept.keys())))
+    return Survey(landmarks, {i: views[i] for i in kept}, left_out, found, tuple(dict.fromkeys(notes)), errors)
 
 
-def _moved(graph: SurveyGraph, marker: int) -> str | None:
-    """Sentence on a given marker that the sightings put elsewhere than its sigmas allow; None: they do not."""
-    first, count = graph.installation.landmarks[marker]
-    part = slice(first, first + count)
-    move, sigmas = graph.belief.mean[part], np.maximum(graph.installation.sigmas[part], 1e-9)
-    most = float((np.abs(move) / sigmas).max())
-    if most <= _MOVED:
-        return None
-    turned = math.degrees(float(np.linalg.norm(move[3:])))
-    return (
-        f"marker {marker} was given {np.linalg.norm(move[:3]):.2f} m and {turned:.0f}° from where the sightings have "
-        f"it, {most:.0f} σ: its place, the size of a marker, the camera's calibration or mounting is wrong, or the "
-        "floor is not flat"
-    )
+def _moved(graph: SurveyGraph, markers: Iterable[int]) -> Iterator[str]:
+    """Sentence on the given marker that the survey moves most, if by more than its sigmas allow.
+
+    Others are drawn along by one that is wrong, and it by them: its residual is the largest in sigmas of residuals.
+
+    Source: Baarda 1968, "A testing procedure for use in geodetic networks" (data snooping).
+    """
+    moves = {}
+    for i in markers:
+        first, count = graph.installation.landmarks[i]
+        part = slice(first, first + count)
+        move, variance = graph.belief.mean[part], np.square(graph.installation.sigmas[part])
+        left = np.maximum(variance - np.diag(graph.belief.cov)[part], 1e-3 * variance + 1e-12)
+        moves[i] = float((np.abs(move) / np.sqrt(left)).max()), move
+    marker, (most, move) = max(moves.items(), key=lambda item: item[1][0], default=(-1, (0.0, np.zeros(6))))
+    if most > _MOVED:
+        turned = math.degrees(float(np.linalg.norm(move[3:])))
+        yield (
+            f"marker {marker} contradicts the other sightings: they move it by {np.linalg.norm(move[:3]):.2f} m and "
+            f"{turned:.0f}°, {most:.0f} σ. Its place, the size of a marker, the camera's calibration or mounting is "
+            "wrong, or the floor is not flat; the map that was written is not to be trusted"
+        )
 
 
 def _need_ends(distances: Sequence[Distance], start: Mapping[int, Landmark], left_out: Mapping[int, str]) -> None:

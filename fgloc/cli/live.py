@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import signal
 import sys
 import threading
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
 
 _SWITCH_S = 1e-3  # the thread that publishes waits no longer than this for the one that estimates
 _STATUS_S = 0.5  # time between two changes of the status line ...
-_LOGGED_S = 60.0  # ... and between two lines of a log in which nothing changes
+_LOGGED_S = 60.0  # ... between two lines of a log in which nothing changes ...
+_AT_MOST_EVERY_S = 2.0  # ... and in which much does
 
 DomainOption = Annotated[int, typer.Option("--domain", metavar="N", envvar="ROS_DOMAIN_ID", help="DDS domain")]
 NetworkOption = Annotated[
@@ -175,8 +177,8 @@ def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
     with Live(Text(), console=console, auto_refresh=False, transient=True, redirect_stdout=on_screen) as line:
 
         def show() -> None:
-            if (found := _state_and_pose(node)) is not None:
-                line.update(Text("  ".join(found)), refresh=True)
+            if (found := _shown(node)) is not None:
+                line.update(Text(found[-1]), refresh=True)
 
         with _regularly(show, stop):
             yield
@@ -202,30 +204,31 @@ def _regularly(work: Callable[[], None], stop: threading.Event) -> Iterator[None
 
 
 def _logged(node: Node) -> Callable[[], None]:
-    """Function that prints the state when it changes, and once a minute."""
-    last, said_s = "", 0.0
+    """Function that prints mode and pose: at a change of mode, staleness or alert, and each minute."""
+    last: tuple[object, ...] = ()
+    said_s = -math.inf
 
     def show() -> None:
         nonlocal last, said_s
-        found = _state_and_pose(node)
-        if found is not None and (found[0].partition(" ")[0] != last or time.monotonic() > said_s + _LOGGED_S):
-            last, said_s = found[0].partition(" ")[0], time.monotonic()
-            _tell("  ".join(found))
+        found, now = _shown(node), time.monotonic()
+        if found is not None and now - said_s > (_LOGGED_S if found[:-1] == last else _AT_MOST_EVERY_S):
+            last, said_s = found[:-1], now
+            _tell(found[-1])
 
     return show
 
 
-def _state_and_pose(node: Node) -> tuple[str, str] | None:
-    """Mode (or what is stale, or an alert) and newest pose as texts; None: there is none yet."""
+def _shown(node: Node) -> tuple[str, bool, bool, str] | None:
+    """Mode, whether it is stale, whether it alerts, and the line with the newest pose; None: there is none yet."""
     live = node.live
     pose = None if live is None else live.pose_at()
     if live is None or pose is None:
         return None
     x, y, yaw = pose.pose
     sigma = float(max(pose.cov[0, 0], pose.cov[1, 1])) ** 0.5
-    status = live.status()
-    state = status.stale or status.alert or str(pose.mode)
-    return state, f"x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
+    status, mode = live.status(), str(pose.mode)
+    line = f"{status.stale or status.alert or mode}  x {x:.3f} m  y {y:.3f} m  yaw {yaw:.3f} rad  ±{sigma:.3f} m"
+    return mode, bool(status.stale), bool(status.alert), line
 
 
 def _with_initial_pose(config: Config, text: str | None) -> Config:

@@ -47,6 +47,7 @@ _STEEPEST = 30.0  # of a prior's cost: its exponential is a number
 _WINDOW_S = (
     20.0  # over which the wheels' path is laid on the map: shorter ones hardly turn, and leave range and place alike
 )
+_OF_THREE = 0.05  # least sigma of the scale of a map of which three landmarks are seen: only a unit is told by them
 _SPREAD_M = 0.5  # of the landmarks of a window, for its yaw
 _ROUNDS = 3  # of the noise and the fit
 _FEWEST_ON_MAP = 100  # sightings
@@ -471,7 +472,7 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
         part, _ = _laid_on(kept, places, shift, mirrored)
         if len(part) >= _FEWEST_WINDOWS:
             left_out.append([float(np.median(part))])
-    sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else scale * misfit
+    sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else scale * max(misfit, _OF_THREE)
     return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit, len(scales))
 
 

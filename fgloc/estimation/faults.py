@@ -141,7 +141,8 @@ class FaultVerdict:
     Attributes:
         budget: which of them are rejected and why, or the scale on their covariances.
         earlier: what was found out of the newest steps, this one included ...
-        span: ... and of how many of them.
+        span: ... and of how many of them ...
+        doubted: ... or of how many since wheels and model were doubted first, but for those with another judgement.
         nis: of the difference of wheels and reference source over the least likely window; NaN without one.
         threshold: that ``nis`` is held against.
     """
@@ -149,6 +150,7 @@ class FaultVerdict:
     budget: NoiseBudget = field(default_factory=NoiseBudget)
     earlier: NoiseBudget = field(default_factory=NoiseBudget)
     span: int = 1
+    doubted: int = 0
     nis: float = math.nan
     threshold: float = math.nan
 

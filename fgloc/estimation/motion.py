@@ -127,10 +127,10 @@ class SteadyMotion:
         self._fix: PoseWithCovariance | None = None
         self._fixed_ns = 0
 
-    def predict(self, start_ns: int, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Motion ``(3,)`` between two times, and its covariance ``(3, 3)``."""
+    def predict(self, start_ns: int, stamp_ns: int) -> tuple[FloatArray, FloatArray] | None:
+        """Motion ``(3,)`` between two times, and its covariance ``(3, 3)``; None: there was no fix yet."""
         if self._fix is None:
-            return np.zeros(3), np.diag(self._any) * ((stamp_ns - start_ns) * 1e-9) ** 2
+            return None
         before, after = (max(t - self._fixed_ns, 0) * 1e-9 for t in (start_ns, stamp_ns))
         stays = _STEADY_S * (math.exp(-before / _STEADY_S) - math.exp(-after / _STEADY_S))
         return self._twist * stays, np.diag(self._gone(after) - self._gone(before))
@@ -151,7 +151,9 @@ class SteadyMotion:
         kept = math.exp(-seconds / _STEADY_S)
         expected, variance = kept * self._twist, kept**2 * self._variance + (1.0 - kept**2) * self._any
         went = se2.log(se2.between(last.pose, belief.pose)) / seconds
-        noise = (np.diag(last.cov) + np.diag(belief.cov)) / seconds**2
+        noise = (
+            np.diag(last.cov) + np.diag(belief.cov)
+        ) / seconds**2 + self._any * seconds / 3.0  # it changes meanwhile
         gain = variance / (variance + noise)
         self._twist, self._variance = expected + gain * (went - expected), (1.0 - gain) * variance
 
@@ -332,7 +334,7 @@ class MotionSources:
             self._silent_s = after
         motion, cov = np.zeros(3), np.diag(np.square(self._widest)) * (after**2 - before**2)
         if self._steady is not None and carried_s is None:
-            motion, cov = self._steady.predict(step.start_ns, step.stamp_ns)
+            motion, cov = self._steady.predict(step.start_ns, step.stamp_ns) or (motion, cov)
         gyro = None if readings is None else readings.gyro
         if gyro is not None:
             motion, cov[2, 2] = with_yaw(motion, float(gyro.motion[2])), gyro.cov[2, 2]
@@ -521,6 +523,7 @@ class MotionFaultMonitor:
         """Begin the test with the first step of the run, or of a segment."""
         if self._first_ns is None:
             self._first_ns = step.start_ns
+        self._doubted_steps = 0
         self.reset()
 
     def reset(self) -> None:
@@ -544,15 +547,17 @@ class MotionFaultMonitor:
                 step.dt, difference.value, difference.cov, difference.by_installation, difference.installation_cov
             )
             self._travelled(step.dt, readings)
-        wrong, span = self._wrong_sources(step, readings, verdict)
+        wrong, span, doubted = self._wrong_sources(step, readings, verdict)
         scale = 1.0 if verdict.flagged else verdict.scale
         self.compared_s += step.dt * (readings.learned is not None)
         self.left_out_s += step.dt * ("learned" in wrong)
         budget, earlier = NoiseBudget({**wrong, **rejected}, scale), NoiseBudget(wrong if span else {}, scale)
-        return FaultVerdict(budget, earlier, span or verdict.span, verdict.nis, verdict.bound)
+        return FaultVerdict(budget, earlier, span or verdict.span, doubted, verdict.nis, verdict.bound)
 
-    def _wrong_sources(self, step: Step, readings: MotionReadings, verdict: GlrResult) -> tuple[dict[str, str], int]:
-        """Wrong sources with the reason, and the number of newest steps for which that is news."""
+    def _wrong_sources(
+        self, step: Step, readings: MotionReadings, verdict: GlrResult
+    ) -> tuple[dict[str, str], int, int]:
+        """Wrong sources with the reason; for how many of the newest steps that is news; how many both were doubted."""
         since, was_left_out = verdict.since, self._model_wrong_s > 0.0
         self._differing_steps = since or self._differing_steps + 1
         found = self._contradicted(step, readings, verdict)
@@ -582,14 +587,13 @@ class MotionFaultMonitor:
         if verdict.flagged:
             self._count(before.get("wheels"), wrong.get("wheels"), since)
         news = "wheels" in contradicted or ("learned" in contradicted and not was_left_out)
-        doubted = self._doubted_steps
-        if found is not None:
+        # A model of another robot is wrong all the time: it was while both were doubted
+        doubted = self._doubted_steps if contradicted == {"learned"} else 0
+        if found is not None or self._proven:
             self._doubted_steps = 0
-            if contradicted == {"learned"} and doubted:  # a model of another robot is wrong all the time: it was then
-                return wrong, max(doubted, found.steps)
         if since or found is None or not news or before.keys() == wrong.keys():
-            return wrong, since
-        return wrong, found.steps
+            return wrong, since or min(doubted, 1), doubted
+        return wrong, found.steps, doubted
 
     def _compares_model(self, readings: MotionReadings) -> bool:
         """Whether the test of this step holds wheels against a model that does not read them."""
@@ -970,9 +974,11 @@ class MotionJudge:
         log, newest = self._estimator.log.keyframes, self._estimator.k
         changed: dict[int, Sequence[MotionMeasurement]] = {}
         decisions: list[Decision] = []
-        frames = (log[i] for i in range(newest - verdict.span + 2, newest + 1) if i in log)
+        first = newest - verdict.span + 2
+        frames = (log[i] for i in range(min(first, newest - verdict.doubted + 2), newest + 1) if i in log)
         for frame in (f for f in frames if f.prior is None):
-            revised = _revised(frame, verdict.earlier)
+            judged = frame.budget.rejected.get("wheels", DOUBTED) != DOUBTED  # soundly, in a stretch of doubt
+            revised = None if judged and frame.k < first else _revised(frame, verdict.earlier)
             if revised is None:
                 continue
             frame.budget = revised

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from robot_world import SPEED, START_NS, TURN, Chain, World, beacons
 from scipy.stats import chi2
 
 from fgloc import se2
-from fgloc.config import Config, GyroConfig, MotionConfig
+from fgloc.config import Config, GyroConfig, MotionConfig, WheelsConfig
 from fgloc.estimation.faults import FaultVerdict
 from fgloc.estimation.log import motion_decisions
 from fgloc.estimation.motion import MotionFaultMonitor, MotionSources, source_difference
@@ -292,3 +293,34 @@ def test_the_covariance_of_a_blind_stretch_does_not_depend_on_the_cadence(tmp_pa
     for a, b in zip(*grown, strict=True):
         assert np.diag(a)[2] == pytest.approx(np.diag(b)[2], rel=0.05)
         assert np.trace(a[:2, :2]) == pytest.approx(np.trace(b[:2, :2]), rel=0.05)
+
+
+# --- motion that nothing measures -------------------------------------------------------------------------------------
+
+
+def gone(fixes: int, steps: int, seconds: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+    """Sigmas and way of a robot that nothing measures, in so many steps after fixes at 0.5 m/s, ten a second."""
+    none = WheelMotion(WheelsConfig(source="none"))
+    sources = MotionSources(Config(), MotionSensors(none, unmeasured=True))
+    start = 10**18
+    for k in range(fixes):
+        belief = PoseWithCovariance(np.array([0.05 * k, 0.0, 0.0]), np.eye(3) * 1e-6)
+        start = 10**18 + k * 10**8
+        sources.commit(MotionReadings(), belief, start)
+    limits = np.linspace(start, start + seconds * 1e9, steps + 1).astype(np.int64).tolist()
+    made = [sources.unknown(Step(0, 0, a, b)) for a, b in pairwise(limits)]
+    return np.sqrt(sum(np.diag(m.cov) for m in made)), sum(m.motion for m in made)
+
+
+@pytest.mark.parametrize("fixes", [0, 1, 20])
+def test_what_nothing_measures_is_as_unsure_in_one_step_as_in_many(fixes):
+    for one, many in zip(gone(fixes, 1), gone(fixes, 60), strict=True):
+        np.testing.assert_allclose(one, many, rtol=1e-6, atol=1e-9)
+
+
+def test_a_robot_that_nothing_measures_goes_on_as_the_fixes_had_it():
+    sigmas, way = gone(20, 6, 0.5)
+    assert way == pytest.approx([0.22, 0.0, 0.0], abs=0.02)  # 0.25 m, as it may slow down
+    assert sigmas[0] < 0.6 * gone(0, 6, 0.5)[0][0]
+    _, far = gone(20, 60, 60.0)
+    assert far == pytest.approx([1.0, 0.0, 0.0], abs=0.1)  # 0.5 m/s for the time constant

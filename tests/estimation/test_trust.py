@@ -327,4 +327,4 @@ def test_a_model_that_sightings_contradict_was_wrong_for_as_long_as_both_were_do
     sightings.seen = True
     found = run(trust, 1, sides(1.4 * LEFT, 1.5 * RIGHT), first=100)[0]
     assert found.budget.rejected == found.earlier.rejected == earlier
-    assert found.span == (101 if wrong == {"learned"} else 5)
+    assert found.doubted == (101 if wrong == {"learned"} else 0)

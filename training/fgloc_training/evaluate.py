@@ -194,15 +194,17 @@ _WITH, _WITHOUT = "with the model", "without it"
 def worth(model: MotionModel, runs: Sequence[Run]) -> dict[str, float]:
     """Drift over 10 s [%] of what else tells the motion in these runs, with the model and without it, by name.
 
-    Commands alone are calibrated where there is no model. Empty: no run has 10 s with truth throughout.
+    Commands alone are calibrated where there is no model. Sets of sensors that lack what the model reads are left out.
+    Empty: no run has 10 s with truth throughout.
     """
-    found: dict[str, list[Rollout]] = {
-        f"commands, {_WITHOUT}": [roll_kinematics(model.card.kinematics, run, STEP_S) for run in runs],
-        f"commands, {_WITH}": [roll_model(model, run, STEP_S) for run in runs],
-    }
+    reads = {name for name in ("wheels", "gyro") if model.card.reads(name)}
+    found: dict[str, list[Rollout]] = {}
+    if not reads:
+        found[f"commands, {_WITHOUT}"] = [roll_kinematics(model.card.kinematics, run, STEP_S) for run in runs]
+        found[f"commands, {_WITH}"] = [roll_model(model, run, STEP_S) for run in runs]
     beside = {"wheels": False, "wheels and gyro": True} if all(run.sensors.has_wheels for run in runs) else {}
     for name, with_gyro in beside.items():
-        if not with_gyro or all(run.sensors.has_gyro for run in runs):
+        if all(run.sensors.has_gyro for run in runs) if with_gyro else "gyro" not in reads:
             for label, given in ((_WITHOUT, None), (_WITH, model)):
                 found[f"{name}, {label}"] = [roll_sources(run, STEP_S, given, with_gyro) for run in runs]
     try:
@@ -217,7 +219,7 @@ def told_worth(drifts: Mapping[str, float]) -> str:
     parts = []
     for name in names:
         before, after = drifts[f"{name}, {_WITHOUT}"], drifts[f"{name}, {_WITH}"]
-        parts.append(f"{name} {before:.3g} % -> {after:.3g} % with the model ({100.0 * (after / before - 1.0):+.0f} %)")
+        parts.append(f"{name} {before:.3g} % -> {after:.3g} % with the model")
     return f"drift over {_WORTH_S:.0f} s without a landmark: {'; '.join(parts)}" if parts else ""
 
 

@@ -28,6 +28,7 @@ from fgloc.types import FloatArray
 from fgloc_training.data import Run
 
 _FIX_RAD = 0.002  # of the truth's yaw
+_SINCE_FIX_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,10 +103,10 @@ def roll_model(model: MotionModel, run: Run, step_s: float) -> Rollout:
 def roll_sources(run: Run, step_s: float, model: MotionModel | None = None, with_gyro: bool = False) -> Rollout:
     """Dead reckoning by the wheels, and by model and gyro with them, as the localizer measures and fuses them.
 
-    The gyro's bias follows the truth, as it follows fixes until they end.
+    The gyro's bias is as well known as with a fix at each step, its turn as vague as 10 s after the last one.
 
     Raises:
-        ModelError: the recording holds no wheel odometry.
+        ModelError: the recording holds no wheel odometry, or a gap of it.
     """
     if not run.sensors.has_wheels:
         raise ModelError(f"{run.name}: no wheel odometry in the recording")
@@ -122,8 +123,10 @@ def roll_sources(run: Run, step_s: float, model: MotionModel | None = None, with
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
         events = run.sensors.step(start_ns, end_ns, history_s)
-        readings = sources.read(events)
-        motions = NoiseBudget().combine(readings, sources.rules) or [sources.unknown(events, readings)]
+        readings = sources.read(events, _SINCE_FIX_S if with_gyro else 0.0)
+        if readings.wheels is None:
+            raise ModelError(f"{run.name}: no wheel motion at {start_ns} ns")
+        motions = NoiseBudget().combine(readings, sources.rules)
         after = predict(origin, unknown, sources.factors.installation, motions)
         if gyro is not None:
             known = round((end_ns - run.origin_ns) * 1e-9 / run.dt_s)

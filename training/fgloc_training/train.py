@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from fgloc.errors import ConfigError, RecordingError
+from fgloc.errors import ConfigError, FglocError, RecordingError
 from fgloc.files.atomic import atomic_folder, check_out
 from fgloc.instrumentation import counted
 from fgloc.sensors.base import Signal
@@ -457,8 +458,10 @@ def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
 
 
 def _figures(path: Path, card: ModelCard, runs: Mapping[str, Run]) -> str:
-    """Figures of a model, and what it is worth in the recordings that it was not trained on."""
+    """Figures of a model, and what it is worth in the recordings that test it, or else validated it."""
     figures = ", ".join(f"{k} {v:g}" for k, v in card.figures.items() if k.startswith(("drift", "nis")))
     tested = [runs[name] for name in card.split.test or card.split.validation if name in runs]
-    told = told_worth(worth(load_model(path), tested)) if tested else ""
+    told = ""
+    with suppress(FglocError):  # it is a remark: the model is made
+        told = told_worth(worth(load_model(path), tested)) if tested else ""
     return f"{path.stem}: {figures}" + (f"\n{path.stem}: {told}" if told else "")
