@@ -38,7 +38,7 @@ _TURNED: dict[type[ast.cmpop], type[ast.cmpop]] = {
 }  # fmt: skip
 _SHIFTED: dict[type[ast.cmpop], type[ast.cmpop]] = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
 _NEUTRAL = {
-    "bool": ("False", "True"), "int": ("0",), "float": ("0.0",), "list": ("[]",), "dict": ("{}",), "tuple": ("()",),
+    "bool": ("False", "True"), "int": ("0",), "float": ("0.0",), "list": ("[]",), "dict": ("{{}}",), "tuple": ("()",),
     "set": ("set()",), "frozenset": ("frozenset()",), "None": ("None",), "FloatArray": ("np.zeros_like({})",),
 }  # fmt: skip
 _SILENT = {"__repr__", "__str__", "__post_init__"}
@@ -122,8 +122,8 @@ def _neutral(node: ast.Return, returns: ast.expr | None) -> Iterator[str]:
     kinds = [n.strip().partition("[")[0] for n in ast.unparse(returns).strip("'\"").split("|")]
     for kind in [kinds[-1]] if kinds[-1] == "None" else kinds[:1]:
         for text in _NEUTRAL.get(kind, ()):
-            if text != ast.unparse(node.value):
-                yield "return " + text.format(ast.unparse(node.value))
+            if (neutral := text.format(ast.unparse(node.value))) != ast.unparse(node.value):
+                yield f"return {neutral}"
 
 
 def _changed(node: ast.expr) -> Iterator[str]:
