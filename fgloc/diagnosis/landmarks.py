@@ -308,12 +308,12 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
         ranges = Figure(by_wheels.value * fit.scale.value, by_wheels.value * fit.scale.sigma)
         relative = math.hypot(fit.scale.sigma / fit.scale.value, by_wheels.sigma / by_wheels.value)
         on_map = Figure(fit.scale.value, fit.scale.value * relative)
-        if by_wheels.sigma > _UNSURE * by_wheels.value:
+        if by_wheels.sigma > _UNSURE * by_wheels.value or not varied(path):
             return  # the wheels do not tell distances, as on one circle
         if on_map.off(1.0, _SCALE):
             _three(found, by_wheels, on_map, ranges)
             return
-    if not by_wheels.off(1.0, _SCALE):
+    if not (by_wheels.off(1.0, _SCALE) and varied(path)):
         return
     unit = unit_of(by_wheels.value)
     named = f" (they are in {unit[1]})" if unit is not None else ""

@@ -255,6 +255,13 @@ def test_fault_52_a_contradiction_that_nothing_explains_is_said_too():
     assert alone(diagnose(events(world), LandmarkMap(mixed)), "map.contradiction").severity is Severity.ERROR
 
 
+@pytest.mark.parametrize(("seconds", "seed"), [(10.0, 0), (10.0, 5), (30.0, 3)])
+def test_a_robot_that_circles_steadily_tells_no_distances(seconds, seed):
+    """A landmark that circles about it may be at any distance, and its sensor anywhere."""
+    driven = World(room(), seed=seed, seconds=seconds, rate=5)
+    assert not diagnose(driven.events(), room(), CAMERA)
+
+
 @pytest.mark.parametrize(("known", "seed"), [(3, 6), (3, 7), (3, 9), (4, 20), (4, 23)])
 def test_a_map_of_another_place_is_in_no_unit_though_few_of_its_ids_are_seen(known, seed):
     world, rng = beacons(), np.random.default_rng(seed)
