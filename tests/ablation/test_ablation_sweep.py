@@ -162,7 +162,8 @@ def test_fault_70_killed_sweep_resumes_and_runs_nothing_twice(folder, swept, tmp
 
 
 def test_job_that_cannot_run_is_quarantined_and_listed(folder, tmp_path):
-    variants = [{"name": "no motion", "config": {"recording": {"topics": {"odometry": "none"}}}}]
+    silent = {"odometry": "none", "sightings": "none"}
+    variants = [{"name": "no motion", "config": {"recording": {"topics": silent}}}]
     jobs = jobs_of(folder, variants=variants, failures=[])
     (record,) = sweep(jobs, tmp_path, workers=1).values()
     assert record.outcome == "refused"

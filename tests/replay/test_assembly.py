@@ -66,8 +66,13 @@ def test_a_recording_with_camera_and_map_gives_all_parts(tmp_path):
 
 
 def test_without_motion_the_topics_that_are_there_are_named(tmp_path):
-    with refusal(RecordingError, "/camera/image/compressed (sensor_msgs/msg/CompressedImage)"):
-        build(tmp_path, motion=False)
+    with refusal(RecordingError, "/camera/camera_info (sensor_msgs/msg/CameraInfo)"):
+        build(tmp_path, motion=False, image=None)
+
+
+def test_images_alone_are_enough(tmp_path):
+    parts = build(tmp_path, motion=False)
+    assert parts.localizer.motion.sources.unmeasured
 
 
 def test_fault_36_images_without_camera_info_name_the_remedy(tmp_path):
