@@ -27,7 +27,7 @@ from fgloc.types import FloatArray, Landmark, LandmarkMap
 
 _SIZE_M = {1: 0.225, 13: 0.12, 17: 0.16}
 _MOUNTED = {17: [0.1, 0.0, 0.0, 0.0, 0.0, np.pi / 2]}  # elsewhere the rig is the camera
-_SURE = ("position_sigma_m", "rotation_sigma_rad", "focal_sigma", "principal_sigma_px")
+_SURE = ("position_sigma_m", "rotation_sigma_rad", "focal_sigma", "principal_sigma_px", "distortion_sigma")
 _MODES = ("batch", "online")
 
 
