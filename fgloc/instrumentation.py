@@ -1,7 +1,8 @@
-"""Progress of long work, reported to a listener if there is one, and wall time by phase."""
+"""Progress of long work, reported to a listener if there is one, work beside other work, and wall time by phase."""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -82,6 +83,24 @@ def counted(items: Iterable[T], label: str, total: float | None = None, unit: st
             tell(label, done, total, unit)
     finally:
         end(label)
+
+
+@contextmanager
+def repeated(work: Callable[[], None], every_s: float, name: str) -> Iterator[None]:
+    """Do a piece of work again and again in a thread while the block runs; an error that it raises ends the thread."""
+    over = threading.Event()
+
+    def repeat() -> None:
+        while not over.wait(every_s):
+            work()
+
+    thread = threading.Thread(target=repeat, name=name, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 # --- Time and threads -------------------------------------------------------------------------------------------------

@@ -303,11 +303,13 @@ def _without_effect(config: Config, section: str, camera: str) -> Iterator[str]:
 
 
 _WHEELS: frozenset[Role] = frozenset({"odometry", "joints", "command"})
+TELLING_MOTION = _WHEELS | {"imu", "image", "sightings"}
+"""Roles of which a run needs one: without wheels, sightings tell how the robot moves."""
 
 
 def _need_motion(facts: StreamFacts) -> None:
-    """Refuse a stream in which nothing tells of motion; sightings alone do, where there are no wheels."""
-    if not {"odometry", "joints", "command", "imu", "image", "sightings"} & base_roles(facts.roles):
+    """Refuse a stream in which nothing tells how the robot moves."""
+    if not TELLING_MOTION & base_roles(facts.roles):
         raise RecordingError(
             f"{facts.name}: no odometry, joint states or commands, no IMU and no images or sightings; a run needs one "
             f"of them. Topics: {facts.topics}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -28,6 +27,7 @@ from fgloc.ablation.jobs import (
 from fgloc.ablation.suite import NOTHING, Cell
 from fgloc.config import Config
 from fgloc.errors import ConfigError, FglocError, OutputError
+from fgloc.instrumentation import repeated
 from fgloc.recording.storage import find_beside
 
 Progress = Callable[[int, int], None]
@@ -192,7 +192,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
                 silence_logs="ERROR",
             ) as cluster,
             distributed.Client(cluster) as client,
-            _replacing(cluster, workers),
+            # those that the cluster has given up, as it does with one that dies again while it starts
+            repeated(lambda: cluster.scale(workers), _WATCH_S, "worker-watch"),
         ):
             yield client
 
@@ -205,24 +206,6 @@ def _local_cluster(**settings: Any) -> Any:
         return distributed.LocalCluster(**settings)
     except OSError as error:
         raise OutputError(f"the worker processes cannot be started ({error}); is the disk full?") from error
-
-
-@contextmanager
-def _replacing(cluster: Any, workers: int) -> Iterator[None]:
-    """Replace workers that the cluster has given up, as it does with one that dies again while it starts."""
-    over = threading.Event()
-
-    def watch() -> None:
-        while not over.wait(_WATCH_S):
-            cluster.scale(workers)
-
-    thread = threading.Thread(target=watch, name="worker-watch", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
 
 
 # --- Batch smoothing of many bags: each is a job, with a folder for all files of its run ------------------------------

@@ -18,6 +18,7 @@ import typer
 from fgloc.cli.options import Bag, ModelOption, configured, need
 from fgloc.cli.terminal import EXIT_LOST, columns, run_bar, say, say_remark
 from fgloc.errors import ConfigError, FglocError
+from fgloc.instrumentation import repeated
 
 if TYPE_CHECKING:
     from fgloc.config import Config
@@ -76,7 +77,7 @@ def live(
             gc.freeze()  # collecting what was imported would hold up publishing now and then, and the end by 0.3 s
             try:
                 shown = _page(node, settings, landmarks) if view else nullcontext(_tell)
-                with shown as tell, _status_line(node, stop):
+                with shown as tell, _status_line(node):
                     node.run(stop, tell)
             finally:
                 node.close()
@@ -162,10 +163,10 @@ def _page(node: Node, config: Config, landmarks: LandmarkMap | None) -> Iterator
 
 
 @contextmanager
-def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
+def _status_line(node: Node) -> Iterator[None]:
     """Show mode and pose while the block runs: on a terminal in one line, else at a change and each minute."""
     if not sys.stderr.isatty():
-        with _regularly(_logged(node), stop):
+        with repeated(_logged(node), _STATUS_S, "fgloc-status-line"):
             yield
         return
     from rich.console import Console
@@ -180,27 +181,8 @@ def _status_line(node: Node, stop: threading.Event) -> Iterator[None]:
             if (found := _shown(node)) is not None:
                 line.update(Text(found[-1]), refresh=True)
 
-        with _regularly(show, stop):
+        with repeated(show, _STATUS_S, "fgloc-status-line"):
             yield
-
-
-@contextmanager
-def _regularly(work: Callable[[], None], stop: threading.Event) -> Iterator[None]:
-    """Do a piece of work every `_STATUS_S` while the block runs."""
-    ended = threading.Event()
-
-    def repeat() -> None:
-        with suppress(FglocError):  # the run has failed, and says so itself
-            while not stop.is_set() and not ended.wait(_STATUS_S):
-                work()
-
-    thread = threading.Thread(target=repeat, name="fgloc-status-line", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def _logged(node: Node) -> Callable[[], None]:
@@ -220,8 +202,9 @@ def _logged(node: Node) -> Callable[[], None]:
 
 def _shown(node: Node) -> tuple[str, bool, bool, str] | None:
     """Mode, whether it is stale, whether it alerts, and the line with the newest pose; None: there is none yet."""
-    live = node.live
-    pose = None if live is None else live.pose_at()
+    live, pose = node.live, None
+    with suppress(FglocError):  # the run has failed, and says so itself
+        pose = None if live is None else live.pose_at()
     if live is None or pose is None:
         return None
     x, y, yaw = pose.pose

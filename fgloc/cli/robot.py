@@ -64,6 +64,7 @@ def init(
     from fgloc.config import base_roles, load_config
     from fgloc.files.outputs import write_text
     from fgloc.motion_noise import with_motion_noise
+    from fgloc.sensor_setup import TELLING_MOTION
 
     found = first_settings(bag, ask if asks() else None)
     with run_bar("init") as progress:
@@ -80,10 +81,10 @@ def init(
     read = find_beside(bag, "robot.yaml")  # by commands that are given none
     given = "" if read is not None and read.resolve() == out.resolve() else f" --config {shown_path(out)}"
     next_step(f"fgloc info {shown_path(bag)}{given}", "check the recording with it")
-    if not {"odometry", "joints", "command", "imu"} & found.roles.keys():
+    if not TELLING_MOTION & base_roles(found.roles):
         raise ConfigError(
-            f"{bag}: no run is possible, as no topic measures how the robot moves: give one under recording.topics in "
-            f"{out}, or record odometry, joint states, commands or an IMU"
+            f"{bag}: no run is possible, as no topic tells how the robot moves: give one under recording.topics in "
+            f"{out}, or record odometry, joint states, commands, an IMU or images of markers"
         )
     if not {"image", "sightings"} & base_roles(found.roles):
         return  # nothing to survey, or to calibrate on

@@ -151,10 +151,8 @@ class SteadyMotion:
         kept = math.exp(-seconds / _STEADY_S)
         expected, variance = kept * self._twist, kept**2 * self._variance + (1.0 - kept**2) * self._any
         went = se2.log(se2.between(last.pose, belief.pose)) / seconds
-        noise = (
-            np.diag(last.cov) + np.diag(belief.cov)
-        ) / seconds**2 + self._any * seconds / 3.0  # it changes meanwhile
-        gain = variance / (variance + noise)
+        of_poses, of_change = np.diag(last.cov + belief.cov) / seconds**2, self._any * seconds / 3.0
+        gain = variance / (variance + of_poses + of_change)
         self._twist, self._variance = expected + gain * (went - expected), (1.0 - gain) * variance
 
 
@@ -557,7 +555,7 @@ class MotionFaultMonitor:
     def _wrong_sources(
         self, step: Step, readings: MotionReadings, verdict: GlrResult
     ) -> tuple[dict[str, str], int, int]:
-        """Wrong sources with the reason; for how many of the newest steps that is news; how many both were doubted."""
+        """Wrong sources and why; number of newest steps for which that is news; steps since both were doubted."""
         since, was_left_out = verdict.since, self._model_wrong_s > 0.0
         self._differing_steps = since or self._differing_steps + 1
         found = self._contradicted(step, readings, verdict)

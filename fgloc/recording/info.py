@@ -385,7 +385,8 @@ def _roles(
     motion, place, uncalibrated, size, unmounted = LACKING
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
-        text = "No odometry, joint states or commands: nothing measures how the robot moves."
+        told = "sightings alone tell" if {"image", "sightings"} & base_roles(roles) else "nothing measures"
+        text = f"No odometry, joint states or commands: {told} how the robot moves."
         yield Finding(motion, text, Severity.WARNING)
     if not unsettled and not placing_roles(roles, config):
         yield Finding(place, "No images and no marker sightings: nothing bounds the drift.", Severity.WARNING)

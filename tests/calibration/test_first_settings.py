@@ -16,7 +16,7 @@ START_NS, BEAMS, DARK, BRIGHT = 1_700_000_000_000_000_000, 360, 100.0, 900.0
 
 
 def settings(folder, has_map=True, sign=1.0):
-    """Of a robot that winds along for 6 s among reflectors."""
+    """Recording of a robot that winds along for 6 s among reflectors."""
     rng = np.random.default_rng(2)
     with BagWriter(folder / "bag") as bag:
         bag.static_transform(START_NS, "base_link", "laser", (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0))

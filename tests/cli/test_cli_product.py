@@ -319,6 +319,15 @@ def test_init_of_a_recording_without_a_known_topic_writes_settings_and_exits_wit
     assert load_config(file) == config_of({})
 
 
+def test_init_of_sightings_alone_leads_to_a_survey(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(60):
+            bag.range_bearing("/landmarks", START_NS + k * 50_000_000, [(0, 2.0, 0.0)])
+    code, out, err = fgloc("init", tmp_path / "bag", "--out", tmp_path / "robot.yaml")
+    assert code == 0, err
+    assert "next: fgloc map" in out
+
+
 def write_joints(path):
     """A recording without odometry: the geometry of the wheels is not in it."""
     with BagWriter(path) as bag:

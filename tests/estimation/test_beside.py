@@ -20,7 +20,7 @@ NONE = np.zeros((6, 6))
 
 
 def held_against_wheels(visual, seconds=14.0, moving=True):
-    """Of each step of 0.2 s: whether the odometry is used, and why not; ``visual``: its report, by time and pose."""
+    """Whether an odometry is used in each step of 0.2 s, and why not; ``visual`` gives its report by time and pose."""
     rng, pose, events = np.random.default_rng(1), np.array([3.0, 1.0, 0.5]), []
     twist = TWIST * moving
     for k in range(round(20 * seconds) + 1):

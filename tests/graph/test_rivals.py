@@ -1,4 +1,4 @@
-"""What of an installation is sensible."""
+"""Constants put together by eye: their rivals, and what they may be off by."""
 
 import pytest
 

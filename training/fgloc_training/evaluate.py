@@ -202,11 +202,11 @@ def worth(model: MotionModel, runs: Sequence[Run]) -> dict[str, float]:
     if not reads:
         found[f"commands, {_WITHOUT}"] = [roll_kinematics(model.card.kinematics, run, STEP_S) for run in runs]
         found[f"commands, {_WITH}"] = [roll_model(model, run, STEP_S) for run in runs]
-    beside = {"wheels": False, "wheels and gyro": True} if all(run.sensors.has_wheels for run in runs) else {}
-    for name, with_gyro in beside.items():
-        if all(run.sensors.has_gyro for run in runs) if with_gyro else "gyro" not in reads:
-            for label, given in ((_WITHOUT, None), (_WITH, model)):
-                found[f"{name}, {label}"] = [roll_sources(run, STEP_S, given, with_gyro) for run in runs]
+    has_wheels, has_gyro = (all(getattr(run.sensors, name) for run in runs) for name in ("has_wheels", "has_gyro"))
+    beside = {"wheels": has_wheels and "gyro" not in reads, "wheels and gyro": has_wheels and has_gyro}
+    for name in (name for name, is_there in beside.items() if is_there):
+        for label, given in ((_WITHOUT, None), (_WITH, model)):
+            found[f"{name}, {label}"] = [roll_sources(run, STEP_S, given, "gyro" in name) for run in runs]
     try:
         return {name: evaluate(rollouts, _WORTH_S).drift_percent for name, rollouts in found.items()}
     except ValueError:

@@ -116,18 +116,16 @@ def roll_sources(run: Run, step_s: float, model: MotionModel | None = None, with
     wheels, joint = WheelMotion(run.sensors.wheels), None if model is None else model.joint
     sources = MotionSources(config, MotionSensors(wheels, learned, joint, gyro))
     history_s = 0.0 if model is None else model.card.history_s
-    origin, unknown = (
-        PoseWithCovariance(np.zeros(3), np.zeros((3, 3))),
-        InstallationEstimate(np.zeros(0), np.zeros((0, 0))),
-    )
+    origin = PoseWithCovariance(np.zeros(3), np.zeros((3, 3)))
+    constants = InstallationEstimate(np.zeros(0), np.zeros((0, 0)))
 
     def step(start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray]:
         events = run.sensors.step(start_ns, end_ns, history_s)
-        readings = sources.read(events, _SINCE_FIX_S if with_gyro else 0.0)
+        readings = sources.read(events, _SINCE_FIX_S)
         if readings.wheels is None:
             raise ModelError(f"{run.name}: no wheel motion at {start_ns} ns")
         motions = NoiseBudget().combine(readings, sources.rules)
-        after = predict(origin, unknown, sources.factors.installation, motions)
+        after = predict(origin, constants, sources.factors.installation, motions)
         if gyro is not None:
             known = round((end_ns - run.origin_ns) * 1e-9 / run.dt_s)
             if readings.gyro is None or not run.valid[known]:
