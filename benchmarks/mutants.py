@@ -19,7 +19,6 @@ import ast
 import functools
 import hashlib
 import json
-import random
 import sys
 import tempfile
 from collections import Counter
@@ -239,13 +238,18 @@ def mutants_of(file: Path) -> list[Mutant]:
 
 
 def drawn(count: int, seed: int, only: str | None) -> list[Mutant]:
-    """Mutants, as many of each package; of one line at most one."""
+    """Mutants, as many of each package; of one line at most one; the same ones where the code is the same."""
     packages = [only] if only else list(PACKAGES)
     chosen: list[list[Mutant]] = []
     for package in packages:
-        rng = random.Random(f"{seed} {package}")
-        everything = [m for file in mutants_tests.sources() if file.parts[1] == package for m in mutants_of(file)]
-        rng.shuffle(everything)
+        ranked = []
+        for file in (f for f in mutants_tests.sources() if f.parts[1] == package):
+            alike: Counter[tuple[str, str]] = Counter()
+            for m in mutants_of(file):
+                alike[m.before, m.after] += 1
+                what = f"{seed} {file} {m.before} {m.after} {alike[m.before, m.after]}"
+                ranked.append((hashlib.sha256(what.encode()).hexdigest(), m))
+        everything = [m for _, m in sorted(ranked, key=lambda pair: pair[0])]
         each = {(m.file, m.line): m for m in reversed(everything)}
         chosen.append([m for m in everything if each[m.file, m.line] is m])
     return [m for group in zip(*chosen, strict=False) for m in group][:count]  # so that a part of a run is fair too
