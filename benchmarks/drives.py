@@ -32,6 +32,24 @@ Reflectors without identity, ACFR's car park (``car_park.*``):
 
 Nothing was tuned on it: mounting and geometry are the owner's, the intensity is any above 0, all sigmas are defaults.
 
+A car by speed and steering alone, its GNSS cut for 60 s (``car_gnss.*``):
+
+Speed and the angle at the steering wheel are joints of an ``ackermann`` drive with the owner's wheelbase and factor (32),
+the two antennas, told apart by their frames, are `gnss` with a sigma of 0.3 m; there is no gyro. The steering has play.
+Online, a run for each of six cuts; what both antennas measure in a cut is the truth, and not given.
+
+- ``car_gnss.cut60_percent``: error at the end of the cut over the way in it, mean (and deviation) of the cuts.
+  ``.worst``: the largest. ``car_gnss.nees_over_2``: of the antennas' positions over the cuts.
+
+All noises are defaults. Constants fitted to all of it, in place of found, leave 35 to 62 %.
+
+Wheels that their readme describes wrongly, UWB indoors (``uwb_indoor.*``):
+
+- ``uwb_indoor.ate_m``: batch with what ``fgloc init`` writes for the bag as described, by `benchmarks.field`.
+  ``.online.ate_m``, ``.as_described.ate_m`` (the odometry) likewise.
+- ``uwb_indoor.named``: share of the recording's two mistakes (left and right exchanged at half the track; long ranges)
+  that a command names.
+
 A second odometry beside the wheels of the simulated robot (``sim.odometry.*``):
 
 The robots are those of `benchmarks.installed` (floor with patches, as installed, ten seeds), with their cameras. Topic
@@ -83,9 +101,11 @@ import numpy as np
 from scipy.io import loadmat
 
 from benchmarks.common import DATA, Row, main, not_run
-from benchmarks.field import distances
+from benchmarks.field import distances, outcome
 from benchmarks.field_peers import hear
-from benchmarks.field_recordings import RECORDINGS, Recording, mecanum, tricycle
+from benchmarks.field_recordings import RECORDINGS, Recording, car_gnss, mecanum, tricycle
+from benchmarks.field_sheet import SHEET
+from benchmarks.field_sheet import found as is_found
 from benchmarks.recordings import SEEDS, Recorded, Take, cache_folder, changed, load, scenario, truth_of
 from benchmarks.replays import failure, kept, replayed
 from benchmarks.scores import errors
@@ -100,6 +120,7 @@ from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import RunResult, run
 from fgloc.sensors.failures import Scene
+from fgloc.sensors.gnss import GnssEvent, east_north
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.odometry import BesideEvent
 from fgloc.sensors.wheels.events import OdometryEvent
@@ -172,6 +193,8 @@ def measure(quick: bool) -> Iterator[Row]:
             yield from _tricycle(Path(scratch), quick)
     yield from plaza_known()
     yield from car_park_rows()
+    yield from car_gnss_rows(quick)
+    yield from uwb_indoor_rows()
     yield from second_odometry_rows(quick)
     yield from drive_rows(quick)
 
@@ -367,7 +390,9 @@ def car_park_rows() -> Iterator[Row]:
     yield Row(names[3], _rms(distances(placed, known[:, 1:], align=True, lever=False)[:, None]), n=len(known), unit="m")
 
 
-def at_antenna(found: Trajectory, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+def at_antenna(
+    found: Trajectory, truth: FloatArray, antenna: FloatArray = _ANTENNA, sigma_m: float = _GPS_SIGMA_M
+) -> tuple[FloatArray, FloatArray]:
     """Errors ``(n, 2)`` [m] of the antenna's position at times and positions ``(m, 3)``, and the NEES of each ``(n,)``."""
     known = truth[(truth[:, 0] >= found.stamps_ns[0] * 1e-9) & (truth[:, 0] <= found.stamps_ns[-1] * 1e-9)]
     stamps = np.round(known[:, 0] * 1e9).astype(np.int64)
@@ -375,16 +400,103 @@ def at_antenna(found: Trajectory, truth: FloatArray) -> tuple[FloatArray, FloatA
     assert found.covs is not None
     off, nees = np.zeros((len(known), 2)), np.zeros(len(known))
     for i, (pose, k) in enumerate(zip(poses, np.searchsorted(found.stamps_ns, stamps), strict=True)):
-        at = se2.compose(pose, _ANTENNA)[:2]
+        at = se2.compose(pose, antenna)[:2]
         off[i] = at - known[i, 1:]
         J = np.column_stack([np.eye(2), [pose[1] - at[1], at[0] - pose[0]]])
-        cov = J @ found.covs[k] @ J.T + np.eye(2) * _GPS_SIGMA_M**2
+        cov = J @ found.covs[k] @ J.T + np.eye(2) * sigma_m**2
         nees[i] = off[i] @ np.linalg.solve(cov, off[i])
     return off, nees
 
 
 def _rms(off: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+# --- A car whose GNSS is cut ------------------------------------------------------------------------------------------
+
+
+_CUT_S = 60.0
+CUTS_S = (210.0, 230.0, 270.0, 290.0, 310.0, 340.0)
+"""Begin of each cut; the fixes are good at both ends."""
+_FIX_SIGMA_M = 0.3
+_AHEAD_M = {"rear_antenna": 0.0, "front_antenna": 2.03}
+_ORIGIN = (45.6189, 9.2812, 229.0)
+_WHEEL_RATIO = 1.0 / 32.0
+CAR_GNSS: dict[str, Any] = {
+    "recording": {"topics": {"odometry": "none"}},
+    "wheels": {
+        "drive": {
+            "kind": "ackermann",
+            "wheelbase": 1.765,
+            "steering_joints": ["steering_wheel"],
+            "steering_ratio": _WHEEL_RATIO,
+        }
+    },
+    "gnss": {"origin": _ORIGIN, "sigma_m": _FIX_SIGMA_M},
+    "gate": {"max_speed": 30.0},
+}
+
+
+def car_gnss_rows(quick: bool) -> Iterator[Row]:
+    """Rows of the cuts; a quick run has one."""
+    if not (DATA / "car_gnss").is_dir():
+        yield from not_run(
+            ["car_gnss.cut60_percent", "car_gnss.nees_over_2"], f"no {DATA / 'car_gnss'}; set FGLOC_REAL_DATA"
+        )
+        return
+    with tempfile.TemporaryDirectory(prefix="fgloc-car-gnss-") as folder:
+        car_gnss(DATA / "car_gnss", Path(folder))
+        cuts = [in_cut(Path(folder) / "bag", config_of(CAR_GNSS), at_s) for at_s in CUTS_S[: 1 if quick else None]]
+    percents, nees = np.array(cuts).T
+    n = len(cuts)
+    yield Row("car_gnss.cut60_percent", float(np.mean(percents)), float(np.std(percents)), n, "%")
+    yield Row("car_gnss.cut60_percent.worst", float(np.max(percents)), n=n, unit="%")
+    yield Row("car_gnss.nees_over_2", float(np.mean(nees)), float(np.std(nees)), n)
+
+
+def in_cut(bag: Path, config: Config, at_s: float) -> tuple[float, float]:
+    """Error at the end of a cut that begins at this time, in percent of the way in it, and mean NEES/2 over it."""
+    hidden: dict[str, list[tuple[float, float, float]]] = {name: [] for name in _AHEAD_M}
+    start_ns = 0
+
+    def left(events: Iterator[Event]) -> Iterator[Event]:
+        nonlocal start_ns
+        for event in events:
+            start_ns = start_ns or event.received_ns + round(at_s * 1e9)
+            if event.stamp_ns > start_ns + _CUT_S * 1e9:
+                return
+            if not (isinstance(event, GnssEvent) and event.stamp_ns >= start_ns):
+                yield event
+            elif event.latitude != 0.0:  # as without a fix
+                place = east_north(event.latitude, event.longitude, event.altitude, _ORIGIN)
+                hidden[event.frame_id].append((event.stamp_ns * 1e-9, *place.tolist()))
+
+    found = run(bag, None, config, "online", check=False, events=left).trajectory
+    ends, nees = [], []
+    for name, ahead_m in _AHEAD_M.items():
+        off, of_each = at_antenna(found, np.array(hidden[name]), np.array([ahead_m, 0.0, 0.0]), _FIX_SIGMA_M)
+        ends.append(math.hypot(*off[-1]))
+        nees.append(float(np.mean(of_each)) / 2.0)
+    way = float(np.hypot(*np.diff(found.poses[found.stamps_ns >= start_ns, :2], axis=0).T).sum())
+    return 100.0 * float(np.mean(ends)) / way, float(np.mean(nees))
+
+
+# --- Wheels that are described wrongly --------------------------------------------------------------------------------
+
+
+def uwb_indoor_rows() -> Iterator[Row]:
+    """Rows of UWB indoors, with the settings that ``fgloc init`` writes."""
+    if not (DATA / "uwb_indoor").is_dir():
+        yield from not_run(["uwb_indoor.ate_m"], f"no {DATA / 'uwb_indoor'}; set FGLOC_REAL_DATA")
+        return
+    o = outcome(named("uwb_indoor"))
+    for name, key in (("", "batch"), ("online.", "online"), ("as_described.", "odometry")):
+        if key in o.ate:
+            yield Row(f"uwb_indoor.{name}ate_m", o.ate[key], unit="m")
+        else:
+            yield from not_run([f"uwb_indoor.{name}ate_m"], o.error or "no poses")
+    traps = [trap for trap in SHEET if trap.recording == "uwb_indoor"]
+    yield Row("uwb_indoor.named", float(np.mean([is_found(trap, o) for trap in traps])), n=len(traps))
 
 
 # --- A second odometry ------------------------------------------------------------------------------------------------

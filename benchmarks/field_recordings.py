@@ -197,6 +197,27 @@ def _car_park(source: Path, out: Path) -> None:
     _write_map(out, dict(enumerate(loadmat(source / "beac_juan3.mat")["estbeac"])))
 
 
+def car_gnss(source: Path, out: Path) -> None:
+    """Car on a race track: speed [m/s] and angle at the steering wheel [rad] as joints, both antennas on ``/fix``.
+
+    The owner gives no place of the antennas: the rear one is put over the rear axle, the front one a baseline ahead.
+    """
+    antennas = {"/swiftnav/rear/gps_pose": ("rear_antenna", 0.0), "/swiftnav/front/gps_pose": ("front_antenna", 2.03)}
+    with AnyReader([source / "project.bag"]) as reader, new_bag(out, "mcap") as bag:
+        for frame, x in antennas.values():
+            bag.static_transform(reader.start_time, "base_link", frame, (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        for connection, received, raw in reader.messages():
+            m: Any = reader.deserialize(raw, connection.msgtype)
+            if connection.topic in antennas:
+                place = (m.latitude, m.longitude, m.altitude)
+                frame = antennas[connection.topic][0]
+                bag.satellite_fix("/fix", _stamp(m), place, (0.0, 0.0, 0.0), received, frame)
+            else:
+                steering, speed = math.radians(m.point.x), m.point.y / 3.6
+                arrays = ((steering, math.nan), (math.nan, speed))
+                bag.joints("/joints", _stamp(m), ("steering_wheel", "speed"), *arrays, received_ns=received)
+
+
 def _plaza(source: Path, out: Path) -> None:
     """CMU's Plaza 1: increments summed up, ranges to beacons, GPS with the gyro's heading."""
     data = loadmat(source / "Plaza1.mat")

@@ -216,3 +216,15 @@ def test_a_run_finds_the_geometry_of_a_mecanum_drive(mecanum, mode):
     true = result.truth.interpolate(result.trajectory.stamps_ns[known])
     errors = np.hypot(*(result.trajectory.poses[known] - true)[:, :2].T)
     assert np.sqrt(np.mean(errors**2)) < (0.02 if mode == "batch" else 0.05)
+
+
+def test_a_measured_speed_of_a_car_is_no_reset():
+    drive = {"kind": "ackermann", "wheelbase": 2.8}
+    names, nothing = ("speed", "steering_angle"), np.empty(0)
+    events = [
+        JointsEvent(
+            ns(k / 20), ns(k / 20), "/joints", names, np.array([math.nan, 0.0]), np.array([30.0, math.nan]), nothing
+        )
+        for k in range(60)
+    ]
+    assert twist_of(wheels(drive), events) == pytest.approx([30.0, 0.0, 0.0], abs=1e-9)

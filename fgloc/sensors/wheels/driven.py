@@ -78,7 +78,7 @@ class DriveTrack(Track):
                 if seconds > self._config.hold_s:  # nobody knows how often it rolled over
                     return None
                 turned = np.array([math.remainder(turn, roll) for turn in turned.tolist()])
-            moved = self._twist(turned * (self._per_position / seconds), between)
+            moved = self._twist(turned * (self._per_position / seconds), between, MAX_SPEED)
             if moved is not None:
                 return moved
             self.rejections["wheels.encoder_reset"] += 1
@@ -91,14 +91,17 @@ class DriveTrack(Track):
             return None
         return self._twist(rates if self._rates is None else 0.5 * (rates + self._rates), between)
 
-    def _twist(self, rates: FloatArray, steering: FloatArray) -> Moved | None:
-        """Twist of joint rates [rad/s] and steering angles [rad]; None if no robot moves like this."""
+    def _twist(self, rates: FloatArray, steering: FloatArray, fastest: float = math.inf) -> Moved | None:
+        """Twist of joint rates [rad/s] and steering angles [rad]; None if no robot moves like this.
+
+        Differences of angles may be those of an encoder that jumps: they make no more than ``fastest`` [m/s].
+        """
         try:
             twist, by, _ = self._drive.moves(rates.tolist(), steering.tolist())
         except np.linalg.LinAlgError:  # steered so far that the wheels do not determine a motion
             return None
         vx, vy, w = twist.tolist()
-        if not math.hypot(vx, vy) < MAX_SPEED or not abs(w) < MAX_TURN:
+        if not math.hypot(vx, vy) < fastest or not abs(w) < MAX_TURN:
             return None
         return (vx, vy, w), by
 
