@@ -55,6 +55,9 @@ class NoiseDensity(Section):
     yaw_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="rad/√s")
 
 
+_LEAST_SCALE = 1e-3
+
+
 class WheelsConfig(Section):
     """Wheel odometry."""
 
@@ -70,7 +73,7 @@ class WheelsConfig(Section):
     track: float | None = Field(None, ge=1e-3, le=5.0, description="between the contact points")
     angle_range: float | None = expert(None, ge=1e-3, le=1e9, description="where the angle rolls over")
     drive: AnyDrive | None = Field(None, description="another drive (docs/drives.md)")
-    scale_v: float = Field(1.0, ge=1e-3, le=1e3, description="true over reported forward speed")
+    scale_v: float = Field(1.0, ge=_LEAST_SCALE, le=1e3, description="true over reported forward speed")
     scale_omega: float = Field(1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: clockwise")
     yaw_per_m: float = expert(0.0, ge=-1, le=1, description="yaw gained on the straight, by unequal wheels")
     slowdown: float = expert(0.0, ge=0, le=5.0, description="share of the speed lost per rad/s of turning")
@@ -95,6 +98,15 @@ class WheelsConfig(Section):
     )
     slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="sigma of slowdown")
     delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="sigma of delay_s")
+
+    @model_validator(mode="after")
+    def _turns(self) -> WheelsConfig:
+        if abs(self.scale_omega) < _LEAST_SCALE:
+            raise ValueError(
+                f"scale_omega is {self.scale_omega:g}, expected {_LEAST_SCALE:g} or more, or its negative; "
+                "where yaw rates tell nothing, widen turn_scale_sigma"
+            )
+        return self
 
     @property
     def in_radians(self) -> bool:

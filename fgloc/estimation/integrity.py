@@ -27,6 +27,7 @@ from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import innovation, joint_cov
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.observation import Lines
+from fgloc.sensors.measurements import sensor_name
 from fgloc.types import FloatArray, Protection
 
 _INDEPENDENT_S = 10.0  # errors further apart than this are taken to be independent: so many samples has an hour
@@ -272,12 +273,6 @@ class ProtectionLevels:
     def _is_alert(self, position_m: float, yaw_rad: float) -> bool:
         limit, yaw = self._config.alert_m, self._config.alert_yaw_rad
         return (limit is not None and position_m > limit) or (yaw is not None and yaw_rad > yaw)
-
-
-def sensor_name(kind: str) -> str:
-    """Name for the user of the sensor that makes sightings of this kind: ``camera front`` of ``front/corners``."""
-    camera, _, made = kind.rpartition("/")
-    return f"camera {camera}".strip() if made == "corners" else f"sensor of {kind}"
 
 
 def _tails(gap: FloatArray, sigma: FloatArray) -> FloatArray:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import InstallationEstimate
+from fgloc.graph.installation import KNOCKED_M, KNOCKED_RAD, InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
@@ -81,11 +82,13 @@ def rotation_cov(H: FloatArray, rows: tuple[int, int]) -> FloatArray:
 
 # --- A sensor that was knocked ----------------------------------------------------------------------------------------
 
-_KNOCKED = np.array([0.03, 0.03, 0.05])  # m, m, rad: sigma of a mounting's change, in the base's axes
+_KNOCKED = np.array([KNOCKED_M, KNOCKED_M, KNOCKED_RAD])  # sigma of a mounting's change, in the base's axes
 _WRONG_FROM_THE_START = 1e-4  # probability that a mounting is another one than it was measured to be ...
 _KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards
 _LEVEL = 0.5  # share of a camera's changes that do not tilt it: markers in its images contradict a tilt
 _MOST_ONSETS = 8  # of one sensor
+_TURNED = 0.5  # probability that it was the sensor if sightings contradict a gyro
+_CERTAIN = 0.99  # probability from which on the estimator takes a change up
 
 
 class _Onsets:
@@ -97,18 +100,21 @@ class _Onsets:
         information: ``(k, 3, 3)`` on δ.
         evidence: ``(k,)`` twice the log-likelihood ratio to "in place".
         prior: ``(k,)`` probability.
+        since_ns: stamp of each one's first sightings.
         last_ns: stamp of the sensor's last sightings.
     """
 
-    def __init__(self, states: int, unseen: float) -> None:
+    def __init__(self, states: int, unseen: float, first: float) -> None:
         self._unseen = unseen  # share of the changes that the sensor's own sightings do not contradict
+        self._first = first  # prior of the first hypothesis
         self.M, self.moved = np.zeros((0, states, 3)), np.zeros((0, 3))
         self.information, self.evidence, self.prior = np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
+        self.since_ns: list[int] = []
         self.last_ns: int | None = None
 
     def begin(self, stamp_ns: int) -> None:
         """Add a hypothesis that begins now; the least probable of the others goes if there are too many."""
-        prior = self._unseen * _WRONG_FROM_THE_START
+        prior = self._unseen * self._first
         if self.last_ns is not None:
             prior = -self._unseen * math.expm1(-max(stamp_ns - self.last_ns, 0) * 1e-9 * _KNOCKS_PER_S)
         self.last_ns = stamp_ns
@@ -120,6 +126,7 @@ class _Onsets:
         self.moved = np.concatenate([self.moved, np.zeros((1, 3))])
         self.information = np.concatenate([self.information, np.diag(_KNOCKED**-2.0)[None]])
         self.evidence, self.prior = np.append(self.evidence, 0.0), np.append(self.prior, prior)
+        self.since_ns.append(stamp_ns)
 
     def weigh(self, w: FloatArray, G: FloatArray, prior: float, wider: FloatArray) -> None:
         """Add the evidence of white innovations, of which a slip of the wheels is another explanation.
@@ -159,6 +166,7 @@ class _Onsets:
         kept = np.arange(len(self.prior)) != k
         self.M, self.moved, self.information = self.M[kept], self.moved[kept], self.information[kept]
         self.evidence, self.prior = self.evidence[kept], self.prior[kept]
+        del self.since_ns[k]
 
 
 def _either(cost: FloatArray | float, other: FloatArray | float, prior: float) -> FloatArray:
@@ -189,11 +197,28 @@ class MountModes:
         self._states = states
         self._of: dict[str, _Onsets] = {}
         self._taken: tuple[FloatArray, FloatArray, dict[str, FloatArray]] | None = None  # not weighed yet
+        self._first = _WRONG_FROM_THE_START
+        self._set_anew = False  # whether the pose was, since the mountings were found to be as they are
 
     def reset(self) -> None:
-        """Forget all evidence."""
+        """Forget all evidence, as the pose was set anew."""
+        self._set_anew = self._set_anew or bool(self._of)
+        self._first = _WRONG_FROM_THE_START
         self._of.clear()
         self._taken = None
+
+    def suspect(self, turn: float, variance: float) -> None:
+        """Take a change of a mounting for more probable, as sightings agree on a pose that contradicts a gyro.
+
+        A slip of the wheels does not turn a gyro: either it is wrong, or what sees the landmarks was turned.
+
+        Args:
+            turn: by which the yaw by the sightings differs from the gyro's [rad].
+            variance: of that difference.
+        """
+        wide = variance + _KNOCKED[2] ** 2
+        evidence = turn**2 / variance - turn**2 / wide - math.log(wide / variance)
+        self._first = _TURNED * posterior(_WRONG_FROM_THE_START, evidence)
 
     def states_changed(self, added: slice, rows: Sequence[slice]) -> None:
         """Follow `Estimator.give_states`: no change of a mounting has had a part in new states."""
@@ -223,7 +248,7 @@ class MountModes:
         for name in dict.fromkeys(rows):
             if name:
                 unseen = _LEVEL if name.endswith("corners") else 1.0
-                self._of.setdefault(name, _Onsets(self._states, unseen)).begin(stamp_ns)
+                self._of.setdefault(name, _Onsets(self._states, unseen, self._first)).begin(stamp_ns)
         of, by = np.array(rows), dict[str, FloatArray]()
         for name, one in self._of.items():
             G = -(H @ one.M)
@@ -261,6 +286,38 @@ class MountModes:
             for k, prior in enumerate(one.prior.tolist()):
                 share = posterior(prior, float(one.evidence[k]))
                 yield name, share, M[k] @ one.moved[k], M[k] @ spread[k] @ M[k].T
+
+    def changed(self) -> Changed | None:
+        """Sensor whose mounting certainly changed.
+
+        One that is another from the start of the run may have been measured wrongly, and so may the map or the wheels:
+        it is a hypothesis of the bounds alone. The others began when the pose was set anew, or later.
+        """
+        for name, one in self._of.items():
+            for k, prior in enumerate(one.prior.tolist()):
+                if (k > 0 or self._set_anew) and posterior(prior, float(one.evidence[k])) > _CERTAIN:
+                    off, spread = one.M[k] @ one.moved[k], one.M[k] @ np.linalg.solve(one.information[k], one.M[k].T)
+                    return Changed(name, one.since_ns[k], float(one.evidence[k]), off, spread)
+        return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Changed:
+    """Mounting that changed.
+
+    Attributes:
+        kind: of the sensor's sightings.
+        since_ns: stamp of the first of them since then.
+        evidence: twice the log-likelihood ratio to "in place".
+        off: ``(3 + n,)`` error that this made in pose and installation.
+        spread: ``(3 + n, 3 + n)`` covariance of that.
+    """
+
+    kind: str
+    since_ns: int
+    evidence: float
+    off: FloatArray
+    spread: FloatArray
 
 
 _SURE, _HARDLY = 1.0 - 1e-12, 1e-300  # probabilities whose odds are finite
@@ -405,16 +462,26 @@ class LandmarkModes:
             Pose and installation without what its sightings did to them (the belief itself if none were fused), and the
             evidence.
         """
-        row, known = self._rows[landmark_id], self._known(belief)
+        row = self._rows[landmark_id]
         evidence, M = float(self._evidence[row].sum()), self._M[row]
         self.displacements[landmark_id] = self._moved[row].copy()
-        off, P = M @ self._moved[row], joint_cov(belief, known) + M @ self._cov[row] @ M.T
+        off, spread = M @ self._moved[row], M @ self._cov[row] @ M.T
         self._reset(np.ones(len(self._ids), dtype=np.bool_))
+        return self._without(belief, off, spread), evidence
+
+    def take_up(self, change: Changed, belief: PoseWithCovariance) -> PoseWithCovariance:
+        """The belief without what a changed mounting did to it; all hypotheses begin anew."""
+        self.restart()
+        return self._without(belief, change.off, change.spread)
+
+    def _without(self, belief: PoseWithCovariance, off: FloatArray, spread: FloatArray) -> PoseWithCovariance:
+        """Pose and installation without an error ``(3 + n,)`` of this covariance; without one the belief itself."""
         if not off.any():
-            return belief, evidence
-        pose = se2.compose(belief.pose, se2.exp(off[:3]))
+            return belief
+        known = self._known(belief)
+        pose, P = se2.compose(belief.pose, se2.exp(off[:3])), joint_cov(belief, known) + spread
         installation = InstallationEstimate(known.mean + off[3:], P[3:, 3:])
-        return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], installation), evidence
+        return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], installation)
 
     def exclude_if_moved(self, landmark_id: int, moved: FloatArray, evidence: float) -> bool:
         """Leave out a landmark that a search found to be moved, if that is far and clear enough; whether it is."""

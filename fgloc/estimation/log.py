@@ -13,7 +13,8 @@ from fgloc.estimation.faults import FaultVerdict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
 from fgloc.sensors import registry
-from fgloc.types import Decision, FloatArray, Mode, MotionMeasurement, MotionReadings
+from fgloc.sensors.measurements import sensor_name
+from fgloc.types import Decision, FloatArray, Grave, Mode, MotionMeasurement, MotionReadings
 
 JUMP = "jump"  # reasons of places that the run went to: one that nothing connects with the pose before ...
 OVERRULED = "overruled by sightings"  # ... and one nearby, which the motion did not lead to
@@ -83,6 +84,11 @@ def moved_decision(k: int, stamp_ns: int, landmark_id: int, evidence: float, ala
     return Decision(k, stamp_ns, "place", landmark_id, math.sqrt(evidence), evidence, 2, 1.0, "landmark_moved", alarm)
 
 
+def mounting_decision(k: int, stamp_ns: int, kind: str, evidence: float) -> Decision:
+    """The row for a sensor whose mounting changed, by the kind of its sightings."""
+    return Decision(k, stamp_ns, kind, -1, math.sqrt(evidence), evidence, se2.DOF, 1.0, "mounting_changed")
+
+
 def mode_decisions(k: int, stamp_ns: int, mode: Mode, since_fix_s: float, after_s: float) -> tuple[Decision, ...]:
     """The row of a pose that is not ``OK``: its residual is the time without an accepted sighting [s]."""
     if mode is Mode.OK:
@@ -102,6 +108,15 @@ def moved_notes(displacements: Mapping[int, FloatArray]) -> Iterator[str]:
         yield (
             f"marker {landmark_id} does not stand where the map has it: it seems to be {math.hypot(*moved):.2f} m "
             f"off (x {moved[0]:+.2f}, y {moved[1]:+.2f}) and was not used; correct the map or take it down"
+        )
+
+
+def mounting_notes(remounted: Mapping[str, int]) -> Iterator[str]:
+    """Sentence for each sensor that was knocked."""
+    for kind, stamp_ns in remounted.items():
+        yield Grave(
+            f"{sensor_name(kind)} was knocked: its mounting is another one since stamp {stamp_ns * 1e-9:.1f} s, and "
+            "was found again; fix the sensor, and calibrate it where it is now"
         )
 
 

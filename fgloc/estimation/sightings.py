@@ -18,7 +18,14 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.estimation.faults import InnovationBias
 from fgloc.estimation.landmark_modes import LandmarkModes
-from fgloc.estimation.log import OVERRULED, moved_decision, moved_notes, place_decision
+from fgloc.estimation.log import (
+    OVERRULED,
+    mounting_decision,
+    mounting_notes,
+    moved_decision,
+    moved_notes,
+    place_decision,
+)
 from fgloc.estimation.motion import JudgedMotion
 from fgloc.estimation.place import InitialPose
 from fgloc.estimation.pose_fit import Fit, apart, fit_pose
@@ -26,6 +33,7 @@ from fgloc.estimation.tracking import CONTRADICTS, Tracking
 from fgloc.estimation.unnamed import Naming, contradictions
 from fgloc.graph.estimators import Estimator
 from fgloc.graph.factors import LandmarkFactors
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition
@@ -410,6 +418,9 @@ class JudgedSightings:
         return replace(self, accepted=(), decisions=decisions, lines=None)
 
 
+_KNOCK_LANDMARKS, _KNOCK_IMAGES = 2, 3  # at least in an image, and such images in a row, that show another mounting
+
+
 class SightingJudge:
     """Holds the sightings of each step against the predicted pose."""
 
@@ -419,6 +430,11 @@ class SightingJudge:
         self._tracking = tracking
         self._association = Association(config, estimator.factors)
         self._rejections: Counter[str] = Counter()
+        self._adaptive, self._gate = config.weights.adaptive, config.estimator.gate_probability
+        self._remounted: dict[str, int] = {}  # stamp of the first sightings since then, by their kind
+        self._refused: dict[
+            str, tuple[int, int, InstallationEstimate | None]
+        ] = {}  # images, since, installation by them
 
     @property
     def modes(self) -> LandmarkModes:
@@ -433,7 +449,7 @@ class SightingJudge:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user about moved landmarks."""
-        return tuple(moved_notes(self.modes.displacements))
+        return (*moved_notes(self.modes.displacements), *mounting_notes(self._remounted))
 
     @property
     def contradicting(self) -> int:
@@ -452,6 +468,59 @@ class SightingJudge:
         self, step: Step, sightings: Sequence[LandmarkMeasurement], motion: JudgedMotion
     ) -> tuple[JudgedMotion, JudgedSightings]:
         """Sort the sightings of a step; the motion is returned too, with more noise where they found it to be wrong."""
+        motion, seen = self._judge_as_mounted(step, sightings, motion)
+        refused = None if seen.elsewhere is not None else self._knocked(seen)
+        if refused is None:
+            return motion, seen
+        kind, since_ns, nis = refused
+        row = mounting_decision(self._estimator.k + 1, step.stamp_ns, kind, nis)
+        self._remount(kind, since_ns, self._estimator.newest.belief)
+        self.modes.restart()
+        seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
+        return motion, replace(seen, places=(row,))
+
+    def _knocked(self, seen: JudgedSightings) -> tuple[str, int, float] | None:
+        """Sensor all of whose sightings are refused, though another mounting explains those of several images in a row.
+
+        A camera that looks up or down now sees what no pose on the floor explains.
+
+        Returns:
+            Kind of its sightings, stamp of the first such ones, and the χ² of those in the newest image.
+        """
+        if not self._estimator.factors.known or not self._adaptive:
+            return None
+        nis = {(d.kind, d.landmark_id): d.nis for d in seen.decisions if d.reason == "gate"}
+        refused: dict[str, list[LandmarkMeasurement]] = {}
+        for m in (s.measurement for s in seen.rejected):
+            if m.in_pixels and (m.row_kind, m.landmark_id) in nis:
+                refused.setdefault(m.row_kind, []).append(m)
+        for kind in {s.measurement.row_kind for s in seen.accepted}:
+            refused.pop(kind, None)
+            self._refused.pop(kind, None)
+        for kind, own in refused.items():
+            if len({m.landmark_id for m in own}) < _KNOCK_LANDMARKS:
+                continue
+            count, since_ns, now = self._refused.get(kind, (0, own[0].stamp_ns, None))
+            loose = self._estimator.loosened(seen.predicted, kind, now)
+            assert loose.installation is not None
+            found = correct(loose, loose.installation, own, self._estimator.factors)
+            if found is None or found[1] > chi2_bound(self._gate, sum(m.dof for m in own)):
+                self._refused.pop(kind, None)
+                continue
+            self._refused[kind] = count + 1, since_ns, found[0].installation
+            if count + 1 == _KNOCK_IMAGES:
+                return kind, since_ns, sum(nis[kind, m.landmark_id] for m in own)
+        return None
+
+    def _remount(self, kind: str, since_ns: int, belief: PoseWithCovariance) -> None:
+        self._estimator.remount(belief, kind, since_ns)
+        self._refused.pop(kind, None)
+        self._remounted.setdefault(kind, since_ns)
+
+    def _judge_as_mounted(
+        self, step: Step, sightings: Sequence[LandmarkMeasurement], motion: JudgedMotion
+    ) -> tuple[JudgedMotion, JudgedSightings]:
+        """Verdicts if all sensors are mounted as they were."""
         predicted = self._estimator.predict(motion.factors)
         seen = self.associate(step, sightings, predicted)
         if seen.accepted:
@@ -471,7 +540,10 @@ class SightingJudge:
         row = place_decision(self._estimator.k + 1, step.stamp_ns, predicted, nearby, OVERRULED)
         self._rejections["motion.overruled"] += 1
         self.modes.restart()  # the evidence against landmarks came from a pose that was wrong
-        motion = motion.overruled(np.diag(se2.log(se2.between(predicted.pose, fit.pose)) ** 2))
+        miss = se2.log(se2.between(predicted.pose, fit.pose))
+        if motion.readings.gyro is not None:
+            self.modes.mounts.suspect(float(miss[2]), float(predicted.cov[2, 2] + fit.cov[2, 2]))
+        motion = motion.overruled(np.diag(miss**2))
         seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
         return motion, replace(seen, places=(row,))
 
@@ -518,8 +590,16 @@ class SightingJudge:
         belief = self._estimator.log.keyframes[k].belief
         moved = self.modes.observe(motion.factors, seen.predicted, belief, seen.accepted, seen.logged, seen.lines)
         if moved is None:
-            return [], False
+            return self._take_up_change(step, belief)
         without, nis = self.modes.exclude(moved, belief)
         if without is not belief:
             self._estimator.correct(without, moved)
         return [moved_decision(k, step.stamp_ns, moved, nis, self.modes.alarm)], without is not belief
+
+    def _take_up_change(self, step: Step, belief: PoseWithCovariance) -> tuple[list[Decision], bool]:
+        """Likewise for a sensor that was knocked: its mounting is to be found again."""
+        change = self.modes.mounts.changed()
+        if change is None:
+            return [], False
+        self._remount(change.kind, change.since_ns, self.modes.take_up(change, belief))
+        return [mounting_decision(self._estimator.k, step.stamp_ns, change.kind, change.evidence)], True

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from fgloc.calibration.installation import contradicted
 from fgloc.config import is_motion_source
 from fgloc.results import RunData
+from fgloc.sensors.measurements import sensor_name
 from fgloc.stats import SURE_SIGMAS
 from fgloc.types import Decision, IntArray, Trajectory
 
@@ -37,6 +38,10 @@ def plural(count: int, noun: str) -> str:
 
 def _not_used(rows: Sequence[Decision], trajectory: Trajectory) -> str:
     return f"{plural(sum(d.weight == 0.0 for d in rows), 'sighting')} not used"
+
+
+def _found_again(rows: Sequence[Decision], trajectory: Trajectory) -> str:
+    return "mounting found again"
 
 
 def _left_out(rows: Sequence[Decision], trajectory: Trajectory) -> str:
@@ -84,6 +89,7 @@ _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "lifted": _travelled,
     "unconfirmed": _travelled,
     "clock_jump": _clock,
+    "mounting_changed": _found_again,
 }
 
 
@@ -111,6 +117,7 @@ Kind = Literal[
     "lifted",
     "clock_jump",
     "landmark_moved",
+    "mounting_changed",
     "installation",
     "unconfirmed",
     "motion_overruled",
@@ -131,6 +138,7 @@ _TITLES: Mapping[str, str] = {
     "lifted": "robot lifted or pushed",
     "clock_jump": "clock jumped",
     "landmark_moved": "moved",
+    "mounting_changed": "knocked: its mounting changed",
     "installation": "contradicts the given value",
     "unconfirmed": "first pose not confirmed",
     "motion_overruled": "motion contradicted by sightings",
@@ -281,6 +289,8 @@ def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
     if d.kind == "place":
         kind = _OF_PLACES.get(d.reason)
         return None if kind is None else (kind, f"landmark {d.landmark_id}" if d.landmark_id >= 0 else "pose")
+    if d.reason == "mounting_changed":
+        return "mounting_changed", sensor_name(d.kind)
     kind = _OF_SIGHTINGS.get(d.reason)
     if kind == "rejected" and d.landmark_id in moved:
         kind = "landmark_moved"

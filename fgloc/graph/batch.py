@@ -23,6 +23,7 @@ from fgloc.graph.installation import GROUND, InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, fuse
 from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
 from fgloc.graph.noise import whitening_of
+from fgloc.sensors.measurements import seen_since_knocked
 from fgloc.stats import ROUNDING, chi2_bound
 from fgloc.types import FloatArray, IntArray, Landmark, MotionMeasurement
 
@@ -216,12 +217,29 @@ _MOST_STATES = 100  # landmarks of a map that are states over the whole run
 
 
 def of_whole_run(log: MeasurementLog, factors: LandmarkFactors) -> LandmarkFactors:
-    """The factors with those landmarks as states that were seen most; of a map that has few, as they are."""
-    if not factors.installation.stateless:
-        return factors
-    seen = Counter(s.measurement.landmark_id for frame in log.keyframes.values() for s in frame.sightings)
-    known = {*factors.installation.landmarks, *factors.installation.stateless}
-    return factors.with_states([i for i, _ in seen.most_common() if i in known][:_MOST_STATES])
+    """The factors with those landmarks as states that were seen most; of a map that has few, as they are.
+
+    A camera that was knocked is another one since then, also in the log.
+    """
+    if factors.installation.stateless:
+        seen = Counter(s.measurement.landmark_id for frame in log.keyframes.values() for s in frame.sightings)
+        known = {*factors.installation.landmarks, *factors.installation.stateless}
+        factors = factors.with_states([i for i, _ in seen.most_common() if i in known][:_MOST_STATES])
+    names: dict[str, str] = {}
+    for number, change in enumerate(log.remounted, 1):
+        name = f"{names.get(change.kind, change.kind).rpartition('/')[0]}#{number}"
+        factors = factors.with_mounting(names.get(change.kind, change.kind), name, change.before)
+        names[change.kind] = f"{name}/corners"
+        for frame in log.keyframes.values():
+            if frame.stamp_ns >= change.stamp_ns:
+                frame.sightings = tuple(_renamed(s, change.kind, name) for s in frame.sightings)
+                frame.rejected = tuple(_renamed(s, change.kind, name) for s in frame.rejected)
+    return factors
+
+
+def _renamed(sighting: LandmarkFactor, kind: str, name: str) -> LandmarkFactor:
+    measurement, alone = (seen_since_knocked(m, kind, name) for m in (sighting.measurement, sighting.alone))
+    return replace(sighting, measurement=measurement, alone=alone)
 
 
 # --- The smoother -----------------------------------------------------------------------------------------------------

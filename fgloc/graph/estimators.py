@@ -31,7 +31,7 @@ from fgloc.graph.factors import (
 from fgloc.graph.ground import ground_factors, ground_prior, is_level_known, levelled, predict, starting, step_of
 from fgloc.graph.installation import GROUND, VACANT_SIGMA, Installation, InstallationEstimate, installation_of
 from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov, split
-from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
+from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance, Remounting
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.learned.sensor import gains_of
 from fgloc.sensors.measurements import LandmarkMeasurement
@@ -178,6 +178,44 @@ class Estimator(ABC):
                 frame.rejected = (*frame.rejected, *of_it)
         newest = self.newest
         newest.belief, self._corrected = belief, self._k
+        self._begin_at(newest)
+        self._adopt(newest.belief)
+
+    def loosened(
+        self, belief: PoseWithCovariance, kind: str, now: InstallationEstimate | None = None
+    ) -> PoseWithCovariance:
+        """The belief if the mounting of a sensor is no longer what was found of it, but off by what a knock does.
+
+        Args:
+            belief: pose and installation.
+            kind: of the sensor's sightings.
+            now: of the installation, if the mounting in it is the one that is known now.
+        """
+        rows, added = self.installation.mounting(kind)
+        known = belief.installation or self.installed
+        mean, cov = known.mean.copy(), known.cov.copy()
+        cross: FloatArray = np.zeros((3, len(cov))) if belief.cross is None else belief.cross.copy()
+        cov[rows], cov[:, rows], cross[:, rows] = 0.0, 0.0, 0.0
+        cov[rows, rows] = added
+        if now is not None:
+            mean[rows], cov[np.ix_(rows, rows)] = now.mean[rows], now.cov[np.ix_(rows, rows)]
+        return PoseWithCovariance(belief.pose, belief.cov, cross, InstallationEstimate(mean, cov))
+
+    def remount(self, belief: PoseWithCovariance, kind: str, since_ns: int) -> None:
+        """Go on from another newest pose, as the mounting of a sensor changed: the belief is loosened.
+
+        Args:
+            belief: pose and installation without what the change has done to them.
+            kind: of the sensor's sightings.
+            since_ns: stamp of the first of them since then.
+        """
+        self.log.remounted.append(Remounting(kind, since_ns, self.installed.mean))
+        rows, added = self.installation.mounting(kind)
+        self.installation.widen_gate(rows, added)
+        for name in [self.installation.names[i] for i in rows]:
+            self.contradicted.pop(name, None)
+        newest = self.newest
+        newest.belief, self._corrected = self.loosened(belief, kind), self._k
         self._begin_at(newest)
         self._adopt(newest.belief)
 

@@ -18,7 +18,7 @@ import numpy as np
 from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.frames import rotations
-from fgloc.graph.installation import Installation, InstallationEstimate
+from fgloc.graph.installation import Installation, InstallationEstimate, camera_block
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
 from fgloc.graph.observation import Lines, Observations
@@ -244,6 +244,28 @@ class LandmarkFactors:
         for i, name in enumerate(self.installation.names):
             if not name.startswith("map."):
                 known.mean[installation.index[name]] = self._estimated.mean[i]
+        other.estimated = known
+        return other
+
+    def with_mounting(self, kind: str, name: str, before: FloatArray) -> LandmarkFactors:
+        """Copy for a camera that was knocked; see `Installation.with_mounting`.
+
+        Args:
+            kind: of its sightings.
+            name: of the camera since then.
+            before: mean ``(n,)`` of the installation until then; the camera's mounting starts there.
+        """
+        installation = self.installation.with_mounting(kind, name)
+        if installation is self.installation:
+            return self
+        other, (rows, _) = copy.copy(self), self.installation.mounting(kind)
+        other.installation, other._prepared = installation, ((), None)
+        known = installation.prior()
+        for i, own in enumerate(self.installation.names):
+            known.mean[installation.index[own]] = self._estimated.mean[i]
+        first, count = installation.blocks[camera_block(name)]
+        known.mean[first : first + count] = self._estimated.mean[rows[0] : rows[0] + count]
+        known.mean[[installation.index[self.installation.names[i]] for i in rows]] = before[rows]
         other.estimated = known
         return other
 

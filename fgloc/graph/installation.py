@@ -36,6 +36,7 @@ _EFFECTS = {
     "sightings.time_offset_s": (HEADING,),
 }
 _EFFECTS_OF_CAMERA = {"focal": (LENGTH,), "ry_rad": (HEADING,), "time_offset_s": (HEADING,)}
+KNOCKED_M, KNOCKED_RAD = 0.03, 0.05  # sigmas of what a knock changes of a mounting
 _GROUND_SIGMAS = (0.3, 0.15, 0.15)  # m, rad, rad: of a robot somewhere on an uneven floor; ramps of 15° are 0.26 rad
 _SENSORS = ("camera", "cameras", "sightings")  # first part of the names of parameters of what sees landmarks
 _CLOCK_OF_CAMERA, _CLOCK_OF_SIGHTINGS = 11, 2  # row of the clock within its block
@@ -206,6 +207,58 @@ class Installation:
         self.sigmas[rows] = VACANT_SIGMA
         self._vacant.append(first)
         return rows
+
+    def mounting(self, kind: str) -> tuple[IntArray, FloatArray]:
+        """Rows of the mounting of a sensor, and the variance of what a knock does to each.
+
+        Args:
+            kind: of its sightings (`LandmarkMeasurement.row_kind`).
+        """
+        camera, _, made = kind.rpartition("/")
+        block, parts = (camera_block(camera), CAMERA[:6]) if made == "corners" else ("sightings", (SENSOR[1], *PLACE))
+        names = [name for name in (f"{block}.{part}" for part in parts) if name in self.index]
+        knock = [KNOCKED_RAD if name.endswith("_rad") else KNOCKED_M for name in names]
+        return np.array([self.index[name] for name in names], dtype=np.int64), np.square(knock)
+
+    def with_mounting(self, kind: str, name: str) -> Installation:
+        """Copy with a knocked camera a second time, as another one of this name: its mounting may be another.
+
+        Args:
+            kind: of its sightings; that of no camera is none of several: the copy is as this one.
+            name: of the camera since then.
+        """
+        camera, _, made = kind.rpartition("/")
+        if made != "corners" or camera_block(camera) not in self.blocks:
+            return self
+        first, count = self.blocks[camera_block(camera)]
+        rows, at = np.arange(first, first + count), self.constants
+        other = copy.copy(self)
+        for cached in ("_gated", "_least_spread", "motion_rows"):
+            other.__dict__.pop(cached, None)
+        mounting, knock = self.mounting(kind)
+        apart = 1e-6 * self._prior_cov[rows, rows]  # what is still the same: constants of the lens, and the clock
+        apart[mounting - first] = knock
+        added = self._prior_cov[rows]  # rows of what is to be added ...
+        cov = np.insert(np.insert(self._prior_cov, [at] * count, added, axis=0), [at] * count, 0.0, axis=1)
+        new = np.arange(at, at + count)
+        cov[:, new] = cov[new].T  # ... wherever they are no landmarks'
+        cov[np.ix_(new, new)] = self._prior_cov[np.ix_(rows, rows)] + np.diag(apart)
+        other._prior_cov, other._prior_mean = cov, np.insert(self._prior_mean, [at] * count, self._prior_mean[rows])
+        other.sigmas = np.sqrt(np.diag(cov))
+        names = [f"{camera_block(name)}.{part}" for part in CAMERA]
+        other.names = (*self.names[:at], *names, *self.names[at:])
+        other.index = {n: i for i, n in enumerate(other.names)}
+        other.blocks = {**self.blocks, camera_block(name): (at, count)}
+        other.constants += count
+        other.gates = {**self.gates, **dict.fromkeys(names, math.inf)}
+        return other
+
+    def widen_gate(self, rows: IntArray, variances: FloatArray) -> None:
+        """Allow constants to be further off their prior than it says, by variances ``(k,)``."""
+        for i, variance in zip(rows.tolist(), variances.tolist(), strict=True):
+            name = self.names[i]
+            self.gates[name] = math.hypot(self.gates.get(name, float(self.sigmas[i])), math.sqrt(variance))
+        self.__dict__.pop("_least_spread", None)
 
     def _rename(self, rows: slice, names: Iterable[str]) -> None:
         changed = list(self.names)

@@ -62,6 +62,21 @@ class Keyframe:
     ground: FloatArray | None = None  # (3,) height, roll and pitch, as of the belief; on uneven ground
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Remounting:
+    """Change of a sensor's mounting in the run.
+
+    Attributes:
+        kind: of its sightings.
+        stamp_ns: of the first sightings since then.
+        before: mean ``(n,)`` of the installation until then.
+    """
+
+    kind: str
+    stamp_ns: int
+    before: FloatArray
+
+
 @dataclass(slots=True)
 class MeasurementLog:
     """Keyframes in order. ``window_s`` bounds it, unless ``keep_all`` (batch).
@@ -73,6 +88,7 @@ class MeasurementLog:
     keep_all: bool = False
     _whole: int = 0  # the first keyframe that still has all
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    remounted: list[Remounting] = field(default_factory=list)
 
     def append(self, keyframe: Keyframe) -> None:
         """Add the newest keyframe; forget those that the window has left behind."""

@@ -441,6 +441,7 @@ class OnlineRun:
                 names=localizer.factors.installation.names,
                 mean=tuple(installed.mean.tolist()),
                 cov=tuple(tuple(row) for row in installed.cov.tolist()),
+                gates=dict(localizer.factors.installation.gates),
             ),
             gyro=None if gyro is None else GyroState(bias=gyro.bias, bias_variance=gyro.bias_variance),
             odometry=None if self._odometry is None else odometry_state(self._odometry),

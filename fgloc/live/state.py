@@ -37,11 +37,12 @@ class OdometryState(Section):
 
 
 class InstallationState(Section):
-    """Estimate of the installation: names, mean and covariance."""
+    """Estimate of the installation: names, mean and covariance, and gates of constants that a knock has changed."""
 
     names: tuple[str, ...]
     mean: tuple[FiniteFloat, ...]
     cov: tuple[tuple[FiniteFloat, ...], ...]
+    gates: dict[str, FiniteFloat] = Field({})
 
 
 class GyroState(Section):
@@ -144,6 +145,7 @@ def resumed_installation(saved: InstallationState, installation: Installation) -
         return None
     here = {name: i for name, i in here.items() if name in at}
     prior, rows, to = installation.prior(), [at[name] for name in here], list(here.values())
+    installation.gates |= {name: sigma for name, sigma in saved.gates.items() if name in here}
     prior.mean[to] = np.array(saved.mean)[rows]
     prior.cov[np.ix_(to, to)] = np.array(saved.cov)[np.ix_(rows, rows)]
     return prior

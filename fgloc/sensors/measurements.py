@@ -664,6 +664,19 @@ class PoseMeasurement(ABC):
 # --- Those of one kind ------------------------------------------------------------------------------------------------
 
 
+def sensor_name(kind: str) -> str:
+    """Name for the user of the sensor that makes sightings of this kind: ``camera front`` of ``front/corners``."""
+    camera, _, made = kind.rpartition("/")
+    return f"camera {camera}".strip() if made == "corners" else f"sensor of {kind}"
+
+
+def seen_since_knocked(m: LandmarkMeasurement, kind: str, name: str) -> LandmarkMeasurement:
+    """The measurement as one of a camera of another name ("front#1"), if it is of the kind of that camera."""
+    if not isinstance(m, PixelMeasurement) or camera_role(m.camera.name.partition("#")[0], "corners") != kind:
+        return m
+    return replace(m, camera=replace(m.camera, name=name))
+
+
 def corners_of(measurements: Iterable[LandmarkMeasurement]) -> list[PixelMeasurement]:
     """Measurements that are corners, for surveys of markers and checks of the floor."""
     return [m for m in measurements if isinstance(m, PixelMeasurement)]

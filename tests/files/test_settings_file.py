@@ -69,6 +69,7 @@ def test_every_default_is_within_its_bounds():
     [
         ("wheels:\n  track: 0.3\n  trak: 0.4\n", r"robot.yaml:3: wheels.trak: .*'track'"),
         ("gyro: {}\nwheel: {track: 0.3}\n", r"robot.yaml:2: wheel: .*'wheels'"),
+        ("wheels:\n  scale_omega: 0\n", r"robot.yaml:1: wheels: .*scale_omega is 0, expected 0.001 or more"),
         ("wheels:\n  source: tick\n", r"robot.yaml:2: wheels.source: .*'auto', 'twist'"),
         (
             "expert:\n wheels:\n  noise:\n    x_per_sqrt_mm: 1\n",
