@@ -1,6 +1,6 @@
 """Bounds on the error against the truth: ``python -m benchmarks.integrity [--seeds N] [--hours H] [--jobs N]``.
 
-Runs online of the recordings of `benchmarks.installed` (test split), with its failures, and of those recordings of
+Runs online of the recordings of `benchmarks.installed` (test split), with the failures of `benchmarks.mechanisms`, and of those recordings of
 others whose truth is in the frame of their map, with what ``fgloc init`` writes. A pose exceeds its bound if its error
 along the robot, across it or in yaw does. Of a robot that was carried away the time until it sees a marker is left out.
 
@@ -40,9 +40,9 @@ from scipy.special import betaincinv
 from benchmarks import fleet
 from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field_recordings import RECORDINGS
-from benchmarks.installed import CASES
-from benchmarks.recordings import SEEDS, Take, load, prepare
-from benchmarks.replays import failures, floor, replayed
+from benchmarks.mechanisms import CASES, PUSHED, chain, floor_of, settings
+from benchmarks.recordings import SEEDS, Split, Take, changed, load, prepare
+from benchmarks.replays import failure, replayed
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file
 from fgloc.errors import FglocError
@@ -119,9 +119,10 @@ def held(result: RunResult, config: Config, unknown_ns: tuple[int, int] | None =
     return Held(matched.stamps_ns[kept], beyond[kept], matched.distances[kept], off[kept], position[kept], yaw[kept])
 
 
-def simulated(case: str, seed: int) -> Held | None:
+def simulated(case: str, seed: int, split: Split = "test") -> Held | None:
     """A case on a recording; None if no pose was ever found."""
-    recorded = load(Take("installed", floor(case), "test", seed))
+    recorded = load(Take("installed", floor_of(case), split, seed))
+    config = changed(recorded.config, settings(case, recorded))
     bounds, spent = ProtectionLevels.of, [0.0]
 
     def timed(*given: Any) -> Protection:
@@ -131,12 +132,12 @@ def simulated(case: str, seed: int) -> Held | None:
         return made
 
     with mock.patch.object(ProtectionLevels, "of", timed):
-        made = replayed(recorded, recorded.config, failures(case, recorded), seed, batch=False)
+        made = replayed(recorded, config, [failure(d) for d in chain(case, recorded)], seed, batch=False)
     if made is None:
         return None
     whole = 1e-3 * float(made.online.step_ms.sum())
-    unknown = made.unknown_ns(recorded.start_ns)
-    return replace(held(made.online, recorded.config, unknown), step_over_none=whole / (whole - spent[0]))
+    unknown = None if case == PUSHED else made.unknown_ns(recorded.start_ns)
+    return replace(held(made.online, config, unknown), step_over_none=whole / (whole - spent[0]))
 
 
 def driven(drive: fleet.Drive) -> Held:
@@ -157,7 +158,7 @@ def measure(quick: bool, seeds: int, hours: float, jobs: int) -> Iterator[Row]:
     cases = ("none", "slip") if quick else CASES
     runs: dict[str, list[Held]] = {}
     try:
-        prepare(Take("installed", floor(case), "test", seed) for case in cases for seed in chosen)
+        prepare(Take("installed", floor_of(case), "test", seed) for case in cases for seed in chosen)
         for case in cases if chosen else ():
             runs[case] = [run for seed in chosen if (run := simulated(case, seed)) is not None]
             print(f"{case}: {[int(run.beyond.sum()) for run in runs[case]]} poses exceed", flush=True)

@@ -50,7 +50,7 @@ from benchmarks.installed import CASES as INSTALLED_CASES
 from benchmarks.installed import Cell as InstalledCell
 from benchmarks.installed import scores_of
 from benchmarks.mechanisms_off import BY_NAME, JOIN, MECHANISMS, Mechanism, together, watched
-from benchmarks.recordings import MRCLAM, SEEDS, Recorded, Split, Take, changed, folder, load, prepare, robot
+from benchmarks.recordings import MRCLAM, SEEDS, Floor, Recorded, Split, Take, changed, folder, load, prepare, robot
 from benchmarks.replays import FAILURES, Replayed, failure, floor, kept, parallel, replayed
 from benchmarks.scores import Errors, Scores, errors, lost_share, named, slips
 from fgloc.ablation.failures import MovedMarker
@@ -158,7 +158,7 @@ def run(cell: Cell) -> Outcome:
     recorded = robot(cell.source) if isinstance(cell.source, int) else load(cell.source)
     seed = cell.source if isinstance(cell.source, int) else cell.source.seed
     try:
-        chain = [failure(described) for described in _chain(cell, recorded)]
+        failures = [failure(described) for described in chain(cell.case, recorded)]
     except ValueError as error:  # a drive too short for the failure
         return Outcome(failed=str(error))
     smooth = (
@@ -169,8 +169,8 @@ def run(cell: Cell) -> Outcome:
     watching = watched(MECHANISMS) if mechanism is None else nullcontext({})
     with watching as acted, nullcontext() if mechanism is None else mechanism.off():
         try:
-            config = changed(recorded.config, _changes(cell, recorded))
-            made = replayed(recorded, config, chain, seed, smooth)
+            config = changed(recorded.config, settings(cell.case, recorded))
+            made = replayed(recorded, config, failures, seed, smooth)
         except (FglocError, RuntimeError, ValueError, ArithmeticError) as error:
             return Outcome(failed=f"{type(error).__name__}: {str(error).splitlines()[0][:200]}")
     if made is None:
@@ -178,9 +178,14 @@ def run(cell: Cell) -> Outcome:
     return _scored(cell, recorded, made, dict(acted))
 
 
-def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
-    """Failures of a cell, as a suite of ablations describes them."""
-    case = cell.case
+def floor_of(case: str) -> Floor:
+    """Floor on which a case is driven."""
+    like = LIKE.get(case, case)
+    return floor(like) if like in FAILURES else "unequal_radii"
+
+
+def chain(case: str, recorded: Recorded) -> list[dict[str, Any]]:
+    """Failures of a case, as a suite of ablations describes them."""
     kind, _, amount = case.partition("_")
     if case == FOREIGN:
         return []
@@ -200,11 +205,11 @@ def _chain(cell: Cell, recorded: Recorded) -> list[dict[str, Any]]:
     return FAILURES[LIKE.get(case, case)].chain(recorded)
 
 
-def _changes(cell: Cell, recorded: Recorded) -> dict[str, Any]:
-    """Changes of the configuration."""
-    if cell.case == GIVEN:
+def settings(case: str, recorded: Recorded) -> dict[str, Any]:
+    """Changes of the configuration in a case."""
+    if case == GIVEN:
         return {"estimator": {"initial_pose": recorded.truth[0, 1:].tolist()}}
-    return {FOREIGN: _FOREIGN_MODEL, WHEELS: _WHEELS_ALONE}.get(cell.case, {})
+    return {FOREIGN: _FOREIGN_MODEL, WHEELS: _WHEELS_ALONE}.get(case, {})
 
 
 def _scored(cell: Cell, recorded: Recorded, made: Replayed, acted: dict[str, int]) -> Outcome:
@@ -404,9 +409,7 @@ class Scope:
         """Cells of a failure; ``robot_none`` and so on are those of MRCLAM 6."""
         if case.startswith("robot_"):
             return tuple(Cell(robot, case.removeprefix("robot_"), off) for robot in self.robots)
-        like = LIKE.get(case, case)
-        on = floor(like) if like in FAILURES else "unequal_radii"
-        return tuple(Cell(Take("installed", on, self.split, seed), case, off) for seed in seeds)
+        return tuple(Cell(Take("installed", floor_of(case), self.split, seed), case, off) for seed in seeds)
 
     @property
     def all_cases(self) -> tuple[str, ...]:
