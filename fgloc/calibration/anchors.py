@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +101,7 @@ def _drive(bag: Path, config: Config, progress: Progress | None) -> _Drive:
     if rejected["range_bound"]:
         notes.append(
             f"{rejected['range_bound']} of {len(heard) + rejected.total()} ranges are outside of "
-            f"{config.gate.min_range:g} to {config.gate.max_range:g} m: set expert.gate.max_range if they reach farther."
+            f"{config.gate.min_range:g} to {config.gate.max_range:g} m: set expert.gate.max_range if more are right."
         )
     localizer = parts.localizer
     frames = list(localizer.estimator.log.keyframes.values())
@@ -155,19 +155,18 @@ def _off(x: FloatArray, tags: FloatArray, ranges: FloatArray) -> FloatArray:
     return np.asarray((1.0 + x[3]) * distance + x[4] - ranges)
 
 
-def locate(tags: FloatArray, ranges: FloatArray, noise: float, config: UwbConfig) -> _Place | str:
+def locate(tags: FloatArray, ranges: FloatArray, config: UwbConfig) -> _Place | str:
     """The place that explains the ranges to an anchor, or why there is none.
 
     Args:
         tags: ``(n, 2)`` places of the tag [m].
         ranges: ``(n,)`` [m], rid of the configured scale and offset.
-        noise: standard deviation [m] of a range at least.
-        config: priors of scale and offset.
+        config: noise of a range at least, priors of scale and offset.
     """
     if len(ranges) < _FEWEST:
         return f"{len(ranges)} ranges, needed are {_FEWEST}"
     chosen = np.unique(np.linspace(0, len(ranges) - 1, _MOST).astype(int))
-    tags, ranges = tags[chosen], ranges[chosen]
+    tags, ranges, noise = tags[chosen], ranges[chosen], config.sigma_m
     prior = np.maximum([math.inf, math.inf, _HEIGHT_M, config.scale_sigma, config.bias_sigma_m], 1e-6)
 
     def residuals(x: FloatArray, sigma: float) -> FloatArray:
@@ -189,7 +188,7 @@ def locate(tags: FloatArray, ranges: FloatArray, noise: float, config: UwbConfig
     axis, middle = complex(*along), complex(*tags.mean(axis=0))
 
     def mirrored(x: FloatArray) -> complex:
-        return middle + axis * np.conj((complex(*x[:2]) - middle) / axis)
+        return middle + axis * ((complex(*x[:2]) - middle) / axis).conjugate()
 
     for _ in range(2):
         sigma = misfit(best)
@@ -201,7 +200,9 @@ def locate(tags: FloatArray, ranges: FloatArray, noise: float, config: UwbConfig
         rival = min(rivals, key=lambda x: cost[id(x)])
         if cost[id(rival)] - cost[id(best)] < max(_DECIDED, _DECIDED_EACH * len(ranges)):
             places = " and ".join(f"({x[0]:.1f}, {x[1]:.1f})" for x in (best, rival))
-            return f"two places explain its ranges alike, {places} m: mirror images about a straight path. Drive a curve"
+            return (
+                f"two places explain its ranges alike, {places} m: mirror images about a straight path. Drive a curve"
+            )
     J = least_squares(residuals, best, method="lm", args=(sigma,)).jac
     vague = float(np.sqrt(np.diag(np.linalg.pinv(J.T @ J))[:2].max()))
     if vague > _VAGUE_M:
@@ -214,6 +215,7 @@ def locate(tags: FloatArray, ranges: FloatArray, noise: float, config: UwbConfig
 _WIDE_M = 5.0  # sigma of x and y about an approximate place
 _FREE = np.diag(np.square([10.0, 10.0, 3.0]))  # of a first pose that anchors or positions place
 _ORIGIN = np.diag(np.square([1e-4, 1e-4, 1e-5]))  # of one that is the map's origin
+_ROUNDING_M = 1e-3  # least sigma of a place in a map
 _ROUNDS = 5  # of judging all ranges by the solution
 
 
@@ -287,21 +289,44 @@ class _Graph:
         fused = [s.measurement for held in solver.accepted.values() for s in held]
         self.used = Counter(m.target for m in fused if isinstance(m, UwbRange))
 
-    def landmark(self, anchor: int) -> Landmark:
-        """The anchor where it was found, with the covariance ``(3, 3)`` of x, y, z."""
-        rows = [self._index[name] for name in place_parameters(anchor)]
+    def landmarks(self, anchors: Sequence[int], against_each_other: bool = False) -> dict[int, Landmark]:
+        """Anchors where they were found, with covariances ``(3, 3)`` of x, y, z.
+
+        Args:
+            anchors: numbers.
+            against_each_other: without what all of them are moved and turned by, which no drive on this map can tell.
+        """
+        rows = [self._index[name] for i in anchors for name in place_parameters(i)]
         cov = self.belief.cov[np.ix_(rows, rows)]
-        position = np.array(self.section.anchors[anchor]) + self.belief.mean[rows]
-        return Landmark(anchor, position, np.eye(3), 0.0, 0.5 * (cov + cov.T))
+        positions = np.array([self.section.anchors[i] for i in anchors]) + self.belief.mean[rows].reshape(-1, 3)
+        if against_each_other:
+            apart = _apart(positions)
+            cov = apart @ cov @ apart.T + _ROUNDING_M**2 * np.eye(len(rows))
+        blocks = (cov[k : k + 3, k : k + 3] for k in range(0, len(rows), 3))
+        made = zip(anchors, positions, blocks, strict=True)
+        return {i: Landmark(i, position, np.eye(3), 0.0, 0.5 * (own + own.T)) for i, position, own in made}
 
     @staticmethod
     def _off(m: UwbRange, pose: FloatArray, place: _Place) -> float:
         return float(m.by_constants(pose, place.x[3:])[0][0])
 
 
+def _apart(positions: FloatArray) -> FloatArray:
+    """Projection ``(3 n, 3 n)`` of small displacements of points ``(n, 3)`` on those that no planar motion makes.
+
+    Source: Baarda 1973, "S-transformations and criterion matrices".
+    """
+    moves = np.zeros((len(positions), 3, 3))
+    moves[:, 0, 0] = moves[:, 1, 1] = 1.0
+    moves[:, 0, 2], moves[:, 1, 2] = -positions[:, 1], positions[:, 0]
+    G = moves.reshape(-1, 3)
+    return np.asarray(np.eye(len(G)) - G @ np.linalg.pinv(G))
+
+
 # --- The whole --------------------------------------------------------------------------------------------------------
 
-_KNOWN_M, _KNOWN_NOISE = 0.3, 3.0  # sigma of a place that is known, or so many times that of a range
+_KNOWN_M, _KNOWN_RAD = 0.3, 0.1  # sigma of a place that is known, or its share of the mean range
+_FRAME = 3  # anchors that make a frame of their own
 _LEAST_SHARE = 0.5  # of the ranges that have to fit
 
 
@@ -310,7 +335,8 @@ class AnchorSurvey:
     """Result of a survey.
 
     Attributes:
-        landmarks: the anchors as points, those found with covariances ``(3, 3)``, those given as they were.
+        landmarks: the anchors as points, those found with covariances ``(3, 3)``, those given as they were. Where the
+            first pose is the origin, covariances of three anchors and more are those against each other.
         ranges: how many the place of each anchor found is made of, by number.
         left_out: anchors that were heard but are not in the map, with the reason.
         installation: what was found besides, by name.
@@ -358,13 +384,12 @@ def survey_anchors(bag: Path, config: Config, progress: Progress | None = None) 
             f"{bag}: {len(wanted)} unknown anchors, expected at most {MOST_UNSURE}: survey parts of the recording, and "
             "give those found in uwb.anchors"
         )
-    noise = max(section.sigma_m, noise_m([event for own in heard.values() for event, _ in own]) or 0.0)
     places: dict[int, _Place] = {}
     left_out: dict[int, str] = {}
     for i, own in wanted.items():
         tags = np.array([se2.compose(pose, np.array([*section.tag[:2], 0.0]))[:2] for _, pose in own])
         ranges = (np.array([event.range_m for event, _ in own]) - section.bias_m) / section.scale
-        place = locate(tags, ranges, noise, section)
+        place = locate(tags, ranges, section)
         if isinstance(place, str):
             left_out[i] = place
         else:
@@ -372,6 +397,9 @@ def survey_anchors(bag: Path, config: Config, progress: Progress | None = None) 
     if not places:
         raise _none(bag, left_out)
     above = section.tag[2]
+    # Drift widens the misfit, ranges without line of sight the scatter
+    scatter = noise_m([event for own in heard.values() for event, _ in own]) or math.inf
+    noise = max(section.sigma_m, min(scatter, float(np.median([place.misfit for place in places.values()]))))
     given = {i: (section.place_sigmas().get(i) or (0.0, 0.0, 0.0)) for i in section.anchors}
     found = {i: (float(p.x[0]), float(p.x[1]), above + abs(float(p.x[2]))) for i, p in places.items()}
     graph = _Graph(
@@ -386,11 +414,11 @@ def survey_anchors(bag: Path, config: Config, progress: Progress | None = None) 
         ),
     )
     graph.solve(places)
-    surveyed = {i: graph.landmark(i) for i in places}
-    left_out |= dict(_undetermined(graph, surveyed, wanted, max(_KNOWN_M, _KNOWN_NOISE * noise)))
-    kept = {i: m for i, m in surveyed.items() if i not in left_out}
-    if not kept:
+    left_out |= dict(_undetermined(graph, list(places), wanted))
+    determined = [i for i in places if i not in left_out]
+    if not determined:
         raise _none(bag, left_out)
+    kept = graph.landmarks(determined, not drive.parts.sensors and len(determined) >= _FRAME)
     known = {i: Landmark(i, np.array(place), np.eye(3), 0.0) for i, place in section.anchors.items()}
     return AnchorSurvey(
         LandmarkMap(dict(sorted((known | kept).items())), "", "surveyed"),
@@ -403,10 +431,11 @@ def survey_anchors(bag: Path, config: Config, progress: Progress | None = None) 
 
 
 def _undetermined(
-    graph: _Graph, surveyed: Mapping[int, Landmark], heard: Mapping[int, Sequence[object]], known_m: float
+    graph: _Graph, anchors: Sequence[int], heard: Mapping[int, Sequence[tuple[UwbEvent, FloatArray]]]
 ) -> Iterator[tuple[int, str]]:
     """Anchors that the solution does not determine well enough for a map, with the reason."""
-    for i, landmark in surveyed.items():
+    for i, landmark in graph.landmarks(anchors).items():
+        known_m = max(_KNOWN_M, _KNOWN_RAD * float(np.mean([event.range_m for event, _ in heard[i]])))
         sigma = float(np.sqrt(np.diag(landmark.cov)[:2].max()))  # type: ignore[arg-type]
         if graph.used[i] < max(_FEWEST, _LEAST_SHARE * len(heard[i])):
             yield i, f"only {graph.used[i]} of {len(heard[i])} ranges agree on where it is"

@@ -37,7 +37,7 @@ from fgloc.errors import ConfigError
 from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, FoundRow, Parameter, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
-from fgloc.types import Event, FloatArray, SensorEvent
+from fgloc.types import Event, FloatArray, Landmark, SensorEvent
 
 _NUMBER = re.compile(r"(\d+)$")
 _FARTHEST_M = 1e3  # that a radio of this kind reaches
@@ -208,18 +208,18 @@ def _first_section(look: FirstLook) -> FirstSection:
     numbers = sorted({event.anchor for event in events})
     given = look.landmark_map.landmarks if look.landmark_map is not None else {}
     seen_otherwise = {role.rpartition("/")[2] for role in look.roles} & {"image", "sightings"}
-    places = {} if seen_otherwise else {i: given[i].position for i in numbers if i in given}
+    places = {} if seen_otherwise else {i: given[i] for i in numbers if i in given}
     shown = ", ".join(map(str, numbers[:12]))
     if len(places) >= _LEAST_ANCHORS:
         missing: tuple[str, ...] = ()
         lines = [
             "uwb:",
             "  # Nothing but ranges can see the map of this recording: its landmarks are taken for their anchors.",
-            "  anchors:",
-            *(f"    {i}: [{', '.join(f'{value:g}' for value in place)}]" for i, place in places.items()),
+            *anchor_lines(places),
         ]
     else:
-        missing = (f"the places of the anchors {shown}, without which ranges are not used (uwb.anchors)",)
+        text = f"the places of the anchors {shown}, without which ranges are not used (uwb.anchors)"
+        missing = (text if seen_otherwise else f"{text}; `fgloc map` finds them",)
         lines = ["uwb:", f"  # anchors: {{{numbers[0]}: [0.0, 0.0, 2.0]}}  # x y z [m] in the map, of each of {shown}"]
     lines.append("  # tag: [0.0, 0.0, 0.3]  # antenna in the base frame: x y z [m]")
     sigma = noise_m(events)
@@ -229,6 +229,15 @@ def _first_section(look: FirstLook) -> FirstSection:
     about = f"  # Ranges reach {far / _FAR:.0f} m."
     others = {"expert.gate": (about, f"  max_range: {math.ceil(far)}")} if usual < far < _FARTHEST_M else {}
     return FirstSection(tuple(lines), missing, others)
+
+
+def anchor_lines(places: Mapping[int, Landmark]) -> list[str]:
+    """Lines of the section: anchors, and their sigmas where these are known; of x and y alone the height is exact."""
+    sigmas = {i: [*np.sqrt(np.diag(m.cov))[:3], 0.0][:3] for i, m in places.items() if m.cov is not None}
+    rows = {i: m.position for i, m in places.items()}
+    lines = ["  anchors:", *(f"    {i}: [{', '.join(f'{v:.6g}' for v in row)}]" for i, row in rows.items())]
+    known = [f"    {i}: [{', '.join(f'{v:.2g}' for v in row)}]" for i, row in sigmas.items()]
+    return [*lines, "  anchors_sigma_m:", *known] if known else lines
 
 
 def noise_m(events: Sequence[UwbEvent]) -> float | None:
@@ -283,12 +292,12 @@ class Uwb:
             )
         if len(unsure := config.place_sigmas()) > MOST_UNSURE:
             raise ConfigError(
-                f"uwb.anchors_sigma_m is of {len(unsure)} anchors, expected at most {MOST_UNSURE}, as each makes a step "
-                "longer; give it by number, of those that are known least"
+                f"uwb.anchors_sigma_m is of {len(unsure)} anchors, expected at most {MOST_UNSURE}, as each makes a "
+                "step longer; give it by number, of those that are known least"
             )
         return cls(config)
 
-    def measure(self, event: UwbEvent) -> Iterable[PoseMeasurement]:
+    def measure(self, event: UwbEvent) -> Iterable[UwbRange]:
         """One range, if its anchor is known."""
         anchor = self._anchors.get(event.anchor)
         if anchor is None:
