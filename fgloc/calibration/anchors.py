@@ -23,6 +23,7 @@ from fgloc import se2
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import Found, found_values
 from fgloc.config import Config, base_roles
+from fgloc.diagnosis.pairs import MAD
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
@@ -127,7 +128,6 @@ def _drive(bag: Path, config: Config, progress: Progress | None) -> _Drive:
 _MOST = 300  # ranges of an anchor that its approximate place is made of, evenly chosen
 _HEIGHT_M = 2.0  # sigma of an anchor's height over the tag: of a room's walls and ceiling
 _AROUND = np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 8, endpoint=False))
-_MAD = 1.4826  # standard deviation over median of absolute deviations
 _APART = 6.0  # times the misfit: nearer solutions are one
 _DECIDED, _DECIDED_EACH = 12.0, 0.1  # twice the log of the likelihood ratio of two places: of all ranges, and of each
 _FITS = 4.0  # times the misfit: ranges farther off are looked at later
@@ -141,12 +141,10 @@ class _Place:
     Attributes:
         x: ``(5,)`` x, y, height over the tag [m], scale - 1 and offset [m] of the ranges.
         misfit: robust standard deviation of a range [m].
-        sigma: largest of x and y [m].
     """
 
     x: FloatArray
     misfit: float
-    sigma: float
 
 
 def _off(x: FloatArray, tags: FloatArray, ranges: FloatArray) -> FloatArray:
@@ -155,7 +153,7 @@ def _off(x: FloatArray, tags: FloatArray, ranges: FloatArray) -> FloatArray:
     return np.asarray((1.0 + x[3]) * distance + x[4] - ranges)
 
 
-def locate(tags: FloatArray, ranges: FloatArray, config: UwbConfig) -> _Place | str:
+def _locate(tags: FloatArray, ranges: FloatArray, config: UwbConfig) -> _Place | str:
     """The place that explains the ranges to an anchor, or why there is none.
 
     Args:
@@ -178,7 +176,7 @@ def locate(tags: FloatArray, ranges: FloatArray, config: UwbConfig) -> _Place | 
         return np.asarray(least_squares(residuals, start, method="lm", args=(sigma,)).x)
 
     def misfit(x: FloatArray) -> float:
-        return max(noise, _MAD * float(np.median(np.abs(_off(x, tags, ranges)))))
+        return max(noise, MAD * float(np.median(np.abs(_off(x, tags, ranges)))))
 
     z, least = tags[:, 0] + 1j * tags[:, 1], int(ranges.argmin())
     far = max(noise, float(np.ptp(ranges)))
@@ -204,10 +202,10 @@ def locate(tags: FloatArray, ranges: FloatArray, config: UwbConfig) -> _Place | 
                 f"two places explain its ranges alike, {places} m: mirror images about a straight path. Drive a curve"
             )
     J = least_squares(residuals, best, method="lm", args=(sigma,)).jac
-    vague = float(np.sqrt(np.diag(np.linalg.pinv(J.T @ J))[:2].max()))
+    vague = float(np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(best))))[:2].max()))
     if vague > _VAGUE_M:
         return f"known to {vague:.1f} m only: drive nearer to it, and around it"
-    return _Place(best, sigma, vague)
+    return _Place(best, sigma)
 
 
 # --- The graph --------------------------------------------------------------------------------------------------------
@@ -389,7 +387,7 @@ def survey_anchors(bag: Path, config: Config, progress: Progress | None = None) 
     for i, own in wanted.items():
         tags = np.array([se2.compose(pose, np.array([*section.tag[:2], 0.0]))[:2] for _, pose in own])
         ranges = (np.array([event.range_m for event, _ in own]) - section.bias_m) / section.scale
-        place = locate(tags, ranges, section)
+        place = _locate(tags, ranges, section)
         if isinstance(place, str):
             left_out[i] = place
         else:
