@@ -218,10 +218,16 @@ def car_gnss(source: Path, out: Path) -> None:
                 bag.joints("/joints", _stamp(m), ("steering_wheel", "speed"), *arrays, received_ns=received)
 
 
-def _plaza(source: Path, out: Path) -> None:
-    """CMU's Plaza 1: increments summed up, ranges to beacons, GPS with the gyro's heading."""
+def plaza(source: Path, out: Path, since: float = 0.0) -> None:
+    """CMU's Plaza 1: increments summed up, ranges to beacons, GPS with the gyro's heading.
+
+    ``since``: share of the recording that is left out at its beginning.
+    """
     data = loadmat(source / "Plaza1.mat")
-    increments, ranges, truth = data["DR"], data["TD"], data["GT"]
+    first, *_, last = data["DR"][:, 0]
+    increments, ranges, truth = (
+        data[name][data[name][:, 0] >= first + since * (last - first)] for name in ("DR", "TD", "GT")
+    )
     stamps = nanoseconds(_EPOCH_S + increments[:, 0])
     steps = np.column_stack([increments[1:, 1], np.zeros(len(increments) - 1), increments[1:, 2]])
     with new_bag(out, "mcap") as bag:
@@ -480,7 +486,7 @@ RECORDINGS = (
         "plaza",
         "plaza",
         "ranges without bearing, 7 % long; the truth's heading is the odometry's gyro",
-        _plaza,
+        plaza,
         "/truth",
         lever=True,
         landmarks=False,

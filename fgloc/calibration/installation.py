@@ -54,9 +54,7 @@ def found_values(
     - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
     """
     motion = [row for made in registry.MOTION_INSTALLATIONS for row in made.found(config)]
-    sensed = [
-        (row.name, row.parameter, row.at, row.gain) for s in registry.sensors() for row in getattr(s, "found", ())
-    ]
+    sensed = [(row.name, row.parameter, row.at, row.gain) for row in registry.found_rows(config)]
     out = _values([*motion, *sensed, *_sighting_rows()], installation, belief)
     for camera in cameras:
         if (block := camera_block(camera.name)) in installation.blocks:

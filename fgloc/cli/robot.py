@@ -87,7 +87,10 @@ def init(
             f"{out}, or record odometry, joint states, commands, an IMU or images of markers"
         )
     if not {"image", "sightings"} & base_roles(found.roles):
-        return  # nothing to survey, or to calibrate on
+        if "uwb" in found.roles and not load_config(out).uwb.anchors:  # type: ignore[attr-defined]
+            file = shown_path(out.parent / "map.yaml")
+            next_step(f"fgloc map {shown_path(bag)}{given} --out {file}", "survey the anchors")
+        return  # nothing else to survey, or to calibrate on
     landmarks = find_beside(bag, "map.yaml")
     if landmarks is None:
         file = shown_path(out.parent / "map.yaml")
@@ -145,7 +148,10 @@ def make_map(
     """Survey the landmarks of recordings. Without --anchor the first pose is the map's origin.
 
     Markers in images (or their corners) are surveyed in position and orientation, from one or several recordings.
+    Radio anchors whose places uwb.anchors does not have are surveyed by their ranges to a robot that drives curves;
+    where it has some, they make the frame. The lines for robot.yaml are shown.
     """
+    from fgloc.calibration.anchors import surveys_anchors
     from fgloc.calibration.survey import sees_corners, survey
     from fgloc.sensors.maps import configured_map, write_map
 
@@ -160,6 +166,9 @@ def make_map(
                 f"{bags[0]}: no images and no corners of markers; from other sightings only one recording is surveyed, "
                 "without --anchor and --distance"
             )
+        if surveys_anchors(bags[0], settings):
+            _of_anchors(bags[0], out, settings, config)
+            return
         _of_points(bags[0], out, settings, config)
         return
     distances = [_distance(text) for text in distance or ()]
@@ -196,6 +205,35 @@ def _of_points(bag: Path, out: Path, settings: Config, config: Path | None) -> N
     say(f"{len(result.landmarks)} landmarks in {out}")
     _tell_next([bag], out, config)
     exit_unless_trusted(result)
+
+
+def _of_anchors(bag: Path, out: Path, settings: Config, config: Path | None) -> None:
+    """A map of radio anchors; ``config``: the file that was given."""
+    import numpy as np
+
+    from fgloc.calibration.anchors import survey_anchors
+    from fgloc.recording.storage import beside
+    from fgloc.sensors.maps import write_map
+    from fgloc.sensors.uwb import anchor_lines
+
+    with run_bar("map") as progress:
+        found = survey_anchors(bag, settings, progress)
+    write_map(found.landmarks, out)
+    rows = []
+    for i, count in found.ranges.items():
+        landmark = found.landmarks.landmarks[i]
+        x, y, z = landmark.position
+        sigma = np.sqrt(np.diag(landmark.cov))  # type: ignore[arg-type]
+        rows.append((str(i), str(count), f"{x:.2f}, {y:.2f}, {z:.2f}", f"{sigma[:2].max():.2f}", f"{sigma[2]:.2f}"))
+    say_table(("anchor", "ranges", "x, y, z [m]", "sigma", "of height"), rows)
+    for i, why in found.left_out.items():
+        say(f"left out: anchor {i}: {why}")
+    for note in found.notes:
+        say(f"note: {note}")
+    say(f"{len(found.landmarks)} anchors in {out}; for robot.yaml:")
+    say("\n".join(["uwb:", *anchor_lines(found.landmarks.landmarks), f"  sigma_m: {found.noise_m:.2g}"]))
+    if out.resolve() == beside(bag, "map.yaml").resolve():
+        next_step(f"fgloc init {shown_path(bag)} --force", "write a robot.yaml with these lines")
 
 
 def _tell(found: Survey, out: Path) -> None:

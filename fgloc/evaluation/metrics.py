@@ -233,9 +233,10 @@ def all_findings(
 
 
 def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | None:
-    """Finding that the truth is not in the frame of a run whose first pose is the origin, as without a map."""
-    poses = result.trajectory.poses
-    if config.estimator.initial_pose is not None or not np.allclose(poses[0], 0.0, atol=_ORIGIN):
+    """Finding that the truth is not in the frame of a run without a map: of its first pose, of anchors or positions."""
+    at_origin = np.allclose(result.trajectory.poses[0], 0.0, atol=_ORIGIN)
+    placed = result.landmarks is not None and not len(result.landmarks)  # by anchors or positions
+    if config.estimator.initial_pose is not None or not (at_origin or placed):
         return None
     times = (matched.stamps_ns - matched.stamps_ns[0]) * 1e-9
     sentence = truth_sentence(config, np.column_stack([times, matched.truth]), times, matched.estimate)

@@ -435,7 +435,8 @@ class Sensor(Protocol):
 
     A sensor whose measurements depend on constants (`PoseMeasurement.constants`) has a property ``parameters`` too: a
     `Parameter` for each, named ``sensor.constant``, with the sigma of its prior about 0; a tuple ``found`` of
-    `FoundRow` brings them into ``metrics.json``. ``first_settings`` (`FirstSettings`) is its part of ``fgloc init``.
+    `FoundRow`, or a function of the section that makes one, brings them into ``metrics.json``. ``first_settings``
+    (`FirstSettings`) is its part of ``fgloc init``.
     """
 
     name: ClassVar[str]

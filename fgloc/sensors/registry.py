@@ -16,6 +16,7 @@ from fgloc.sensors.base import (
     Context,
     Converter,
     FirstSettings,
+    FoundRow,
     Joiner,
     Parameter,
     Sensor,
@@ -156,6 +157,14 @@ def motion_parameters(config: Config, sources: Collection[str]) -> tuple[Paramet
     """Parameters of the motion sources in the order in which they stand in the state."""
     made = [p for installation in MOTION_INSTALLATIONS for p in installation.parameters(config, sources)]
     return tuple(sorted(made, key=lambda p: p.rank))
+
+
+def found_rows(config: Config) -> Iterator[FoundRow]:
+    """Rows of ``metrics.json`` that parameters of the sensors of installed packages make."""
+    for sensor in sensors():
+        rows = getattr(sensor, "found", ())
+        section = getattr(config, sensor.name, None)
+        yield from (() if section is None else rows(section)) if callable(rows) else rows
 
 
 def first_settings() -> tuple[FirstSettings, ...]:

@@ -15,7 +15,8 @@ then taken as what it says at least: too long by ``nlos_bias_m``, give or take `
 dropped.
 
 Scale and offset that all ranges have in common are constants of the installation, estimated with the pose: Plaza's
-radios measure 7 % too much, antenna delays of ultra-wideband are worth a decimeter.
+radios measure 7 % too much, antenna delays of ultra-wideband are worth a decimeter. So are the places of anchors that
+``anchors_sigma_m`` says are not known exactly. Where they are not known at all, ``fgloc map`` finds them.
 
 Source: Olson, Agarwal 2013, "Inference on networks of mixtures for robust robot mapping".
 """
@@ -24,7 +25,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -36,13 +37,15 @@ from fgloc.errors import ConfigError
 from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, FoundRow, Parameter, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
-from fgloc.types import Event, FloatArray, SensorEvent
+from fgloc.types import Event, FloatArray, Landmark, SensorEvent
 
 _NUMBER = re.compile(r"(\d+)$")
 _FARTHEST_M = 1e3  # that a radio of this kind reaches
 _LEAST_ANCHORS = 3  # that tell a place in the plane
 _AROUND = np.linspace(-math.pi, math.pi, 12, endpoint=False)  # of an anchor: where the search for the first pose begins
+MOST_UNSURE = 40  # anchors whose places are estimated, to bound the work of a step
 _Metres = Annotated[float, Field(ge=-1e5, le=1e5)]
+_Sigma = Annotated[float, Field(ge=0, le=100)]
 SCALE, BIAS = "uwb.range_scale", "uwb.bias_m"
 
 
@@ -55,6 +58,9 @@ class UwbConfig(Section):
     anchors: dict[int, tuple[_Metres, _Metres, _Metres]] = Field(
         {}, max_length=1000, description="x y z [m] in the map, by number"
     )
+    anchors_sigma_m: _Sigma | dict[int, tuple[_Sigma, _Sigma, _Sigma]] = Field(
+        0.0, description="sigma of their places: one for all, or x y z by number; 0: exact"
+    )
     tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
     sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
     scale: float = Field(1.0, ge=0.1, le=10, description="reported over true range, bias_m subtracted")
@@ -66,6 +72,27 @@ class UwbConfig(Section):
     )
     nlos_bias_m: float = Field(1.0, ge=0, le=100, description="such a range is too long by ...")
     nlos_sigma_m: float = Field(3.0, ge=0.01, le=100, description="... and its sigma")
+
+    def place_sigmas(self) -> dict[int, tuple[float, float, float]]:
+        """Sigmas of x, y, z [m] of those anchors that are not known exactly."""
+        given = self.anchors_sigma_m
+        by_number = given if isinstance(given, dict) else dict.fromkeys(self.anchors, (given,) * 3)
+        return {i: sigmas for i, sigmas in by_number.items() if i in self.anchors and any(sigmas)}
+
+
+def place_parameters(anchor: int) -> tuple[str, str, str]:
+    """Names of the parameters that an anchor's place is off by."""
+    return f"uwb.anchor_{anchor}.x_m", f"uwb.anchor_{anchor}.y_m", f"uwb.anchor_{anchor}.z_m"
+
+
+def found_rows(config: UwbConfig) -> tuple[FoundRow, ...]:
+    """Rows of ``metrics.json``: scale and offset of ranges, and the places that are estimated."""
+    places = (
+        FoundRow(name.removesuffix("_m"), name, at, 1.0)
+        for i in config.place_sigmas()
+        for name, at in zip(place_parameters(i), config.anchors[i], strict=True)
+    )
+    return FoundRow(SCALE, SCALE, 1.0, 1.0), FoundRow(BIAS, BIAS, 0.0, 1.0), *places
 
 
 # --- Events -----------------------------------------------------------------------------------------------------------
@@ -109,21 +136,27 @@ class UwbRange(PoseMeasurement):
 
     def residual_at(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Predicted minus measured range ``(1,)``, and its derivative ``(1, 3)`` by the pose."""
-        residual, J, _ = self.by_constants(pose, np.zeros(2))
+        residual, J, _ = self.by_constants(pose, np.zeros(2))  # anchors at their given places
         return residual, J
 
     def by_constants(self, pose: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Residual ``(1,)`` and derivatives by pose ``(1, 3)``, scale and bias [m] of ranges ``(1, 2)``."""
+        """Residual ``(1,)`` and derivatives by pose ``(1, 3)`` and constants ``(1, c)``.
+
+        They are scale and bias [m] of ranges and, where the anchor is not known exactly, what its place is off by [m].
+        """
         x, y, yaw = pose
         c, s = math.cos(yaw), math.sin(yaw)
         tag_x, tag_y, tag_z = self.tag
-        dx = x + c * tag_x - s * tag_y - self.anchor[0]
-        dy = y + s * tag_x + c * tag_y - self.anchor[1]
-        distance = max(math.hypot(dx, dy, tag_z - self.anchor[2]), 1e-6)
+        anchor = self.anchor + values[2:] if len(values) > 2 else self.anchor
+        dx = x + c * tag_x - s * tag_y - anchor[0]
+        dy = y + s * tag_x + c * tag_y - anchor[1]
+        dz = tag_z - anchor[2]
+        distance = max(math.hypot(dx, dy, dz), 1e-6)
         forward, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance  # unit vector in the base's axes
         scale, bias = 1.0 + values[0], values[1]
         J = scale * np.array([[forward, left, left * tag_x - forward * tag_y]])
-        return np.array([scale * distance + bias - self.range_m]), J, np.array([[distance, 1.0]])
+        H = np.array([[distance, 1.0, *(-scale / distance * np.array([dx, dy, dz]))][: len(values)]])
+        return np.array([scale * distance + bias - self.range_m]), J, H
 
     def places(self) -> Iterable[FloatArray]:
         """On the circle about the anchor."""
@@ -175,21 +208,21 @@ def _first_section(look: FirstLook) -> FirstSection:
     numbers = sorted({event.anchor for event in events})
     given = look.landmark_map.landmarks if look.landmark_map is not None else {}
     seen_otherwise = {role.rpartition("/")[2] for role in look.roles} & {"image", "sightings"}
-    places = {} if seen_otherwise else {i: given[i].position for i in numbers if i in given}
+    places = {} if seen_otherwise else {i: given[i] for i in numbers if i in given}
     shown = ", ".join(map(str, numbers[:12]))
     if len(places) >= _LEAST_ANCHORS:
         missing: tuple[str, ...] = ()
         lines = [
             "uwb:",
             "  # Nothing but ranges can see the map of this recording: its landmarks are taken for their anchors.",
-            "  anchors:",
-            *(f"    {i}: [{', '.join(f'{value:g}' for value in place)}]" for i, place in places.items()),
+            *anchor_lines(places),
         ]
     else:
-        missing = (f"the places of the anchors {shown}, without which ranges are not used (uwb.anchors)",)
+        text = f"the places of the anchors {shown}, without which ranges are not used (uwb.anchors)"
+        missing = (text if seen_otherwise else f"{text}; `fgloc map` finds them",)
         lines = ["uwb:", f"  # anchors: {{{numbers[0]}: [0.0, 0.0, 2.0]}}  # x y z [m] in the map, of each of {shown}"]
     lines.append("  # tag: [0.0, 0.0, 0.3]  # antenna in the base frame: x y z [m]")
-    sigma = _noise_m(events)
+    sigma = noise_m(events)
     if sigma is not None and sigma > UwbConfig().sigma_m:
         lines += ["  # By the scatter of ranges that follow one another.", f"  sigma_m: {sigma:.2g}"]
     far, usual = _FAR * float(np.percentile([event.range_m for event in events], 99.0)), GateConfig().max_range
@@ -198,7 +231,16 @@ def _first_section(look: FirstLook) -> FirstSection:
     return FirstSection(tuple(lines), missing, others)
 
 
-def _noise_m(events: Sequence[UwbEvent]) -> float | None:
+def anchor_lines(places: Mapping[int, Landmark]) -> list[str]:
+    """Lines of the section: anchors, and their sigmas where these are known; of x and y alone the height is exact."""
+    sigmas = {i: [*np.sqrt(np.diag(m.cov))[:3], 0.0][:3] for i, m in places.items() if m.cov is not None}
+    rows = {i: m.position for i, m in places.items()}
+    lines = ["  anchors:", *(f"    {i}: [{', '.join(f'{v:.6g}' for v in row)}]" for i, row in rows.items())]
+    known = [f"    {i}: [{', '.join(f'{v:.2g}' for v in row)}]" for i, row in sigmas.items()]
+    return [*lines, "  anchors_sigma_m:", *known] if known else lines
+
+
+def noise_m(events: Sequence[UwbEvent]) -> float | None:
     """Standard deviation [m] of a range by its distance from the line through its neighbours; None: too few."""
     off: list[float] = []
     for number in {event.anchor for event in events}:
@@ -224,10 +266,11 @@ class Uwb:
     )
     failures: ClassVar[tuple[type[Section], ...]] = (NonLineOfSight,)
     first_settings: ClassVar[FirstSettings] = FirstSettings((UwbEvent,), _first_section)
-    found: ClassVar[tuple[FoundRow, ...]] = (FoundRow(SCALE, SCALE, 1.0, 1.0), FoundRow(BIAS, BIAS, 0.0, 1.0))
+    found: ClassVar[Callable[[UwbConfig], tuple[FoundRow, ...]]] = staticmethod(found_rows)
 
     def __init__(self, config: UwbConfig) -> None:
         self._config = config
+        self._sigmas = config.place_sigmas()
         self._anchors: Mapping[int, FloatArray] = {i: np.array(place) for i, place in config.anchors.items()}
         self._tag = np.array(config.tag)
         self._unknown: set[int] = set()
@@ -237,7 +280,7 @@ class Uwb:
         """The sensor of one run; None if no anchors are given.
 
         Raises:
-            ConfigError: fewer anchors than tell a place.
+            ConfigError: fewer anchors than tell a place, or more that are not known exactly than can be estimated.
         """
         config = context.section
         if not config.anchors:
@@ -247,9 +290,14 @@ class Uwb:
                 f"uwb.anchors has {len(config.anchors)} anchor(s), expected at least {_LEAST_ANCHORS} where no map "
                 "says where the robot is; give all that are installed"
             )
+        if len(unsure := config.place_sigmas()) > MOST_UNSURE:
+            raise ConfigError(
+                f"uwb.anchors_sigma_m is of {len(unsure)} anchors, expected at most {MOST_UNSURE}, as each makes a "
+                "step longer; give it by number, of those that are known least"
+            )
         return cls(config)
 
-    def measure(self, event: UwbEvent) -> Iterable[PoseMeasurement]:
+    def measure(self, event: UwbEvent) -> Iterable[UwbRange]:
         """One range, if its anchor is known."""
         anchor = self._anchors.get(event.anchor)
         if anchor is None:
@@ -265,6 +313,7 @@ class Uwb:
             range_m=(event.range_m - config.bias_m) / config.scale,
             anchor=anchor,
             tag=self._tag,
+            constants=(SCALE, BIAS, *(place_parameters(event.anchor) if event.anchor in self._sigmas else ())),
         )
         yield (
             line_of_sight
@@ -278,11 +327,13 @@ class Uwb:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Scale and offset of all ranges."""
+        """Scale and offset of all ranges, and places of anchors."""
         config = self._config
+        places = [zip(place_parameters(i), sigmas, strict=True) for i, sigmas in self._sigmas.items()]
         return (
             Parameter(SCALE, config.scale_sigma, effects=("length",)),
             Parameter(BIAS, config.bias_sigma_m),
+            *(Parameter(name, sigma) for place in places for name, sigma in place),
         )
 
     @property

@@ -79,8 +79,8 @@ def context(section, landmark_map=None, frame=lambda name: None):
     return Context(config_of({}), section, {}, landmark_map, frame)
 
 
-def range_of(uwb, **fields):
-    config = uwb.UwbConfig(anchors=ANCHORS, tag=(0.1, -0.05, 0.3))
+def range_of(uwb, anchors_sigma_m=0.0, **fields):
+    config = uwb.UwbConfig(anchors=ANCHORS, anchors_sigma_m=anchors_sigma_m, tag=(0.1, -0.05, 0.3))
     event = uwb.UwbEvent(1_000, 1_000, "/uwb", anchor=2, range_m=4.0)
     (m,) = uwb.Uwb.build(context(config)).measure(replace(event, **fields))
     return m
@@ -175,11 +175,13 @@ def test_jacobians_are_the_residuals_derivatives(uwb, gnss, which, moved):
         np.testing.assert_allclose(J[:, i], (ahead - behind) / 2e-6, atol=1e-6)
 
 
-def test_derivatives_by_scale_and_offset_of_ranges(uwb):
-    m = range_of(uwb).compensated(np.array([-0.08, 0.01, 0.05]), 1e-4 * np.eye(3))
-    pose, values = np.array([1.2, 2.3, 0.7]), np.array([0.04, -0.1])
+@pytest.mark.parametrize("values", [(0.04, -0.1), (0.04, -0.1, 0.2, -0.3, 0.15)])
+def test_derivatives_by_scale_and_offset_of_ranges_and_the_place_of_the_anchor(uwb, values):
+    m = range_of(uwb, 0.1 if len(values) > 2 else 0.0).compensated(np.array([-0.08, 0.01, 0.05]), 1e-4 * np.eye(3))
+    pose, values = np.array([1.2, 2.3, 0.7]), np.array(values)
+    assert len(m.constants) == len(values)
     _, J, H = m.by_constants_at_keyframe(pose, values)
-    for i, d in enumerate(1e-6 * np.eye(2)):
+    for i, d in enumerate(1e-6 * np.eye(len(values))):
         ahead, behind = (m.by_constants_at_keyframe(pose, values + sign * d)[0] for sign in (1.0, -1.0))
         np.testing.assert_allclose(H[:, i], (ahead - behind) / 2e-6, atol=1e-6)
     for i, d in enumerate(1e-6 * np.eye(3)):
@@ -267,6 +269,14 @@ def test_too_few_anchors_without_a_map_are_refused(uwb):
         uwb.Uwb.build(context(config))
     assert uwb.Uwb.build(context(config, LandmarkMap({}))) is not None
     assert uwb.Uwb.build(context(uwb.UwbConfig())) is None
+
+
+def test_more_places_than_can_be_estimated_are_refused(uwb):
+    many = {i: (float(i), 0.0, 2.0) for i in range(41)}
+    with pytest.raises(ConfigError, match="41 anchors, expected at most 40"):
+        uwb.Uwb.build(context(uwb.UwbConfig(anchors=many, anchors_sigma_m=0.1)))
+    some = uwb.Uwb.build(context(uwb.UwbConfig(anchors=many, anchors_sigma_m={3: (0.1, 0.1, 0.0), 99: (1, 1, 1)})))
+    assert [p.name for p in some.parameters if p.sigma == 0.1] == ["uwb.bias_m", "uwb.anchor_3.x_m", "uwb.anchor_3.y_m"]
 
 
 # --- Steps ------------------------------------------------------------------------------------------------------------
