@@ -1,8 +1,9 @@
 """Bounds on the error against the truth: ``python -m benchmarks.integrity [--seeds N] [--hours H] [--jobs N]``.
 
 Runs online of the recordings of `benchmarks.installed` (test split), with the failures of `benchmarks.mechanisms`, and
-of those recordings of others whose truth is in the frame of their map, with what ``fgloc init`` writes. A pose exceeds its bound if its error
-along the robot, across it or in yaw does. Of a robot that was carried away the time until it sees a marker is left out.
+of those recordings of others whose truth is in the frame of their map, with what ``fgloc init`` writes. A pose exceeds
+its bound if its error along the robot, across it or in yaw does. Of a robot that was carried away the time until it
+sees a marker is left out.
 
 - ``integrity.exceeded``: share of samples 10 s apart that exceed, over all simulated runs; ``.bound95``: the upper end
   of its 95 % interval (Clopper and Pearson); ``.all``: share of all poses; ``integrity.exceeded.CASE``: of one failure.

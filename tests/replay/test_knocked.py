@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +51,8 @@ def recorded(folder: Path, turned: tuple[float, float, float]) -> Path:
 
 
 @pytest.fixture(scope="module", params=[LEVEL, TILTED], ids=["level", "tilted"])
-def knocked(request, tmp_path_factory) -> Iterator[Path]:
-    yield recorded(tmp_path_factory.mktemp("knocked"), request.param)
+def knocked(request, tmp_path_factory) -> Path:
+    return recorded(tmp_path_factory.mktemp("knocked"), request.param)
 
 
 def settled(result: RunResult) -> tuple[float, float]:
