@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -245,11 +245,13 @@ class Association:
         checked = fit is not None and fit.is_checked(self._config.estimator.gate_probability)
         if fit is None or not checked or apart(predicted.pose, fit.pose):
             return None
-        self.rejections.subtract(
-            f"{s.measurement.counted_as}.{d.reason}" for s, d in zip(rejected, decisions, strict=True)
-        )
-        self.rejections += Counter()  # drops the zeros
+        self.take_back((s.measurement, d.reason) for s, d in zip(rejected, decisions, strict=True))
         return fit
+
+    def take_back(self, rejected: Iterable[tuple[LandmarkMeasurement, str]]) -> None:
+        """Count these sightings no longer as rejected for these reasons."""
+        self.rejections.subtract(f"{m.counted_as}.{reason}" for m, reason in rejected)
+        self.rejections += Counter()  # drops the zeros
 
     def _judge(self, measurements: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance) -> Judged:
         """Verdict of the gate on each measurement."""
@@ -472,7 +474,7 @@ class SightingJudge:
         refused = None if seen.elsewhere is not None else self._knocked(seen)
         if refused is None:
             return motion, seen
-        kind, since_ns, nis = refused
+        kind, since_ns, nis = refused  # the sightings of this step are judged again
         row = mounting_decision(self._estimator.k + 1, step.stamp_ns, kind, nis)
         self._remount(kind, since_ns, self._estimator.newest.belief)
         self.modes.restart()
@@ -487,7 +489,7 @@ class SightingJudge:
         Returns:
             Kind of its sightings, stamp of the first such ones, and the χ² of those in the newest image.
         """
-        if not self._estimator.factors.known or not self._adaptive:
+        if not self._estimator.factors.known or not self._adaptive or self._tracking.keeps_initial_pose:
             return None
         nis = {(d.kind, d.landmark_id): d.nis for d in seen.decisions if d.reason == "gate"}
         refused: dict[str, list[LandmarkMeasurement]] = {}
@@ -509,6 +511,7 @@ class SightingJudge:
                 continue
             self._refused[kind] = count + 1, since_ns, found[0].installation
             if count + 1 == _KNOCK_IMAGES:
+                self._association.take_back((m, "gate") for m in own)
                 return kind, since_ns, sum(nis[kind, m.landmark_id] for m in own)
         return None
 

@@ -66,7 +66,7 @@ def settled(result: RunResult) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("mode", ["online", "batch"])
-def test_a_knocked_camera_is_named_and_its_mounting_found_again(knocked, mode):
+def test_fault_72_a_knocked_camera_is_named_and_its_mounting_found_again(knocked, mode):
     result = run(knocked, knocked.parent / "map.yaml", config_of(SETTINGS), mode, check=False)
     found = [j for j in judgements(result) if j.kind == "mounting_changed"]
     assert [j.subject for j in found] == ["camera"]
