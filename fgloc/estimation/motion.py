@@ -97,7 +97,7 @@ class TurnComparison:
         """
         change, left = 0.0, variance
         if self._driven_s > 0.0:
-            of_wheels = (self._per_m * self._way / self._driven_s) ** 2 + float(self._cov[0, 0])
+            of_wheels = (self._per_m * (self._way / self._driven_s)) ** 2 + float(self._cov[0, 0])
             share = variance / (variance + of_wheels)
             change, left = share * (float(self._mean[0]) - bias), variance * (1.0 - share)
         drift = left * ((since_s + seconds) ** 2 - since_s**2)
