@@ -476,7 +476,6 @@ def test_the_status_says_how_the_topics_come_in():
     assert status.mode is Mode.OK
     assert status.running
     assert 0.0 < status.step_ms <= status.step_ms_max <= took_ms
-    assert status.step_ms * status.keyframes <= took_ms
     assert 0.0 <= status.reordering_s < 0.2
     assert status.keyframes > 30
 
