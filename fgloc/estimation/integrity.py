@@ -41,7 +41,6 @@ _FARTHEST = 1e4  # m², rad²: variance of a slip, whatever the wheels say of th
 _CHECKED = 0.25  # of a slip passes the comparison of two independent motion sources
 _WRONG_JUMP = 1e-2  # probability that a place to which the estimate jumps is wrong ...
 _BY_ACCIDENT = 0.1  # ... and that a sighting agrees with it nevertheless
-_LONG_AGO = 100
 _ELSEWHERE = np.diag(np.square([10.0, 10.0, 1.8]))  # m², m², rad²
 _UNBOUNDED = np.full(3, np.inf)
 _LEAST_RAD_S = 0.3  # a slip turns a robot that drives straight on by so much
@@ -144,7 +143,7 @@ class ProtectionLevels:
         samples = max(3600.0 / _INDEPENDENT_S, 1.0)
         risk = config.risk_per_hour / samples / 3.0  # of a sample and axis; a position has that of two
         self._fastest: FloatArray = np.zeros(2)  # speed and yaw rate since the last fix ...
-        self._agreeing = _LONG_AGO  # sightings since the robot was found at another place
+        self._agreeing = math.inf  # sightings since the robot was found at another place
         self._blind_s = 0.0  # ... which was so long before the newest pose
         self._slipped = 0.0  # probability that the wheels slipped just before the last fix
         self._risks = risk * np.array([1.0, 1.0, 1.0, 2.0])

@@ -95,11 +95,11 @@ class TurnComparison:
             bias: of the gyro, as it was learned at rest [rad/s].
             variance: of that [rad²/s²].
         """
-        speed = self._way / self._driven_s if self._driven_s > 0.0 else _USUAL_SPEED
-        of_wheels = (self._per_m * speed) ** 2 + float(self._cov[0, 0])
-        share = variance / (variance + of_wheels)
-        change = share * (float(self._mean[0]) - bias) if self._driven_s > 0.0 else 0.0
-        left = variance * (1.0 - share) if self._driven_s > 0.0 else variance
+        change, left = 0.0, variance
+        if self._driven_s > 0.0:
+            of_wheels = (self._per_m * (self._way / self._driven_s)) ** 2 + float(self._cov[0, 0])
+            share = variance / (variance + of_wheels)
+            change, left = share * (float(self._mean[0]) - bias), variance * (1.0 - share)
         drift = left * ((since_s + seconds) ** 2 - since_s**2)
         return replace(turned, yaw=turned.yaw - change * seconds, variance=turned.noise + drift)
 

@@ -98,6 +98,19 @@ def test_one_stretch_that_ended_elsewhere_is_counted_among_half_a_minute_of_calm
     assert drift.density == pytest.approx(0.3**2 / 32.5 * np.array([0.5, 0.5, 0.0]), rel=0.1, abs=1e-9)
 
 
+def test_a_fix_aside_that_is_gone_soon_is_no_drift():
+    estimator, exact = Chain(config(), room()).localizer.estimator, 1e-8 * np.eye(3)
+    drift = ExcessDrift(estimator)
+    drift.fix(estimator.start(0, PoseWithCovariance(np.zeros(3), exact)))
+    for k in range(1, 26):
+        step = Step(k, 0, (k - 1) * 10**8, k * 10**8)
+        drift.advance(
+            step, [MotionMeasurement("wheels", step.start_ns, step.stamp_ns, np.array([0.04, 0.0, 0.0]), exact)]
+        )
+        drift.fix(PoseWithCovariance(np.array([0.04 * k, 0.3 if k in (9, 10) else 0.0, 0.0]), exact))
+        assert drift.density is None
+
+
 def test_noise_of_the_models_drift_is_the_models_alone():
     budget, moved = NoiseBudget(learned_drift=np.array([1.0, 1.0, 2.0])), np.array([0.1, 0.0, 0.0])
     wheels, learned = (MotionMeasurement(name, 0, 2 * 10**8, moved, 1e-6 * np.eye(3)) for name in ("wheels", "learned"))

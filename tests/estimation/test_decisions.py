@@ -154,3 +154,15 @@ def test_a_bias_that_the_pose_explains_is_none(sigma, biased):
     one = Lines(np.array([1.5, -1.5]), np.eye(2, 3), np.zeros((2, 0)), [2], np.array([False]))
     told = [bias.is_biased("1", k * DT_NS, one, np.eye(3) * sigma**2) for k in range(1, 20)]
     assert any(told) == biased
+
+
+def test_innovations_of_before_a_silence_are_no_bias():
+    """Three of 2.5 sigmas are one together; two are not."""
+    bias = InnovationBias(0.999, 10.0)
+    one = Lines(np.array([2.5]), np.eye(1, 3), np.zeros((1, 0)), [1], np.array([False]))
+
+    def is_biased(seconds):
+        return bias.is_biased("1", round(seconds * 1e9), one, np.eye(3) * 1e-6)
+
+    assert [is_biased(s) for s in (1.0, 2.0, 3.0, 12.9)] == [False, True, True, True]
+    assert [is_biased(s) for s in (23.0, 23.0, 24.0)] == [False, False, True]

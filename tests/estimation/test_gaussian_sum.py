@@ -165,3 +165,14 @@ def test_sightings_within_a_metre_begin_where_the_robot_is_and_accuse_nobody(see
     assert position_error(first[0], world.truth(first[0].stamp_ns)) < 0.3
     assert not chain.localizer.sightings.modes.displacements
     assert np.mean([nees(e, world.truth(e.stamp_ns)) for e in estimates]) / 3.0 < 2.0
+
+
+def test_beacons_along_a_corridor_tell_that_the_robot_is_in_it():
+    """The last beacon of the corridor, seen from 6 m: from there all around, as far as it alone tells."""
+    corridor = [point(k, 2.0 * k, 0.0) for k in range(8)]
+    total = GaussianSum(config(), landmark_map(*corridor))
+    total.add([], [seen_point(np.array([8.0, 0.0, 0.0]), corridor[-1])])
+    belief = total.belief()
+    cov = se2.rotate_cov(belief.cov, float(belief.pose[2]))
+    assert np.sqrt(cov[1, 1]) < 3.0 < np.sqrt(cov[0, 0])
+    assert belief.pose[0] < 12.5

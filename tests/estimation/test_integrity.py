@@ -289,3 +289,31 @@ def test_wheels_that_report_any_speed_leave_a_bound(seed):
     fix = Fix(PoseWithCovariance(STILL, COV), none, lines, 0.5)
     found = ProtectionLevels(IntegrityConfig(), modes).of(COV, np.array([1e12, 0.0, 1e9]), 0.0, False, fix=fix)
     assert np.isfinite(found.bound).all()
+
+
+def test_new_states_of_the_installation_change_nothing_of_what_a_knocked_camera_may_do():
+    """Two rows between the two that there are, on which nothing depends yet."""
+    rng, changed, as_it_was = np.random.default_rng(3), MountModes(5), MountModes(5)
+    A, here = se2.adjoint(np.array([-0.5, 0.0, 0.1])), [0, 1, 2, 3, 6]
+
+    def wider(part, axis):
+        made = np.zeros((part.shape[0], 7) if axis else (7, part.shape[1]))
+        made[(slice(None), here) if axis else here] = part
+        return made
+
+    for k in range(4):
+        H, D = rng.normal(0.0, 100.0, (4, 5)), rng.normal(0.0, 0.1, (3, 2))
+        W, w, gain = np.eye(4) * 1e-2, rng.normal(0.0, 1.0, 4), rng.normal(0.0, 1e-3, (5, 4))
+        as_it_was.move(A, D)
+        as_it_was.take(k * 10**9, H, W, w, gain, ["corners"] * 4)
+        if k == 2:
+            changed.states_changed(slice(1, 3), [])
+        if k >= 2:
+            H, gain, D = wider(H, 1), wider(gain, 0), wider(np.hstack([np.eye(3), D]), 1)[:, 3:]
+        changed.move(A, D)
+        changed.take(k * 10**9, H, W, w, gain, ["corners"] * 4)
+    for modes in (changed, as_it_was):
+        modes.weigh()
+    for found, expected in zip(changed.displaced(), as_it_was.displaced(), strict=True):
+        for a, b in zip(found, expected, strict=True):
+            assert a == pytest.approx(b)

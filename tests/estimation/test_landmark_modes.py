@@ -196,3 +196,15 @@ def test_a_small_marker_is_named_only_if_one_sighting_can_show_it(size_m, off_m,
     chain = Chain(config(markers={"sigma_px": 0.3}), world)
     chain.run(made.events())
     assert (2 in named(chain)) == is_named
+
+
+def test_what_a_moved_beacon_did_to_the_pose_is_no_speed_of_a_robot_that_nothing_measures():
+    """Its speed is that of the fixes; the one that takes the harm back goes half a metre aside."""
+    world = beacons()
+    made = World(world, seconds=6.0, rate=5, shown=moved(world, 0, dx=0.6, dy=-0.6))
+    chain = Chain(config(wheels={"source": "none"}, landmarks=COARSE), world, unmeasured=True)
+    estimates = chain.run(e for e in made.events() if isinstance(e, RangeBearingEvent))
+    told_ns = next(e.stamp_ns for e in estimates for d in e.decisions if d.reason == "landmark_moved")
+    after = [f for f in chain.localizer.estimator.log.keyframes.values() if f.stamp_ns > told_ns][:5]
+    assert [m.source for f in after for m in f.motions] == ["unknown"] * 5
+    assert max(abs(f.motions[0].motion[1]) for f in after) < 0.06

@@ -156,3 +156,18 @@ def test_a_lifted_robot_says_that_it_may_be_elsewhere_until_it_sees_a_marker():
     assert found.mode is Mode.OK
     assert estimates[-1].mode is Mode.OK
     assert np.hypot(*(estimates[-1].pose - world.truth(estimates[-1].stamp_ns))[:2]) < 0.05
+
+
+@pytest.mark.parametrize(("forward", "told"), [(0.0, True), (0.06, False)])
+def test_a_robot_that_stands_and_tilts_is_in_somebodys_hands(forward, told):
+    """By 0.16 rad within a second; one that drives may be on a ramp."""
+    rng, monitor = np.random.default_rng(6), LiftMonitor(10.0, np.array([0.0, 0.0, 1.0]))
+    steps = [step(k, 9.78 + rng.normal(0.0, 0.1, 20)) for k in range(25)]
+    rate = np.array([0.2, 0.0, 0.0])
+    level, tilts = (
+        steps[:20],
+        [replace(s, motion=by_class(replace(e, angular_velocity=rate) for e in s.inertial)) for s in steps[20:]],
+    )
+    assert not any(alarms(monitor, [(s, readings(s, forward)) for s in level]))
+    found = alarms(monitor, [(s, readings(s, forward)) for s in tilts])
+    assert any("tilted_at_rest" in reasons for reasons in found) == told

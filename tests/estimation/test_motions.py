@@ -17,13 +17,14 @@ from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig, WheelsConfig
 from fgloc.estimation.faults import FaultVerdict
 from fgloc.estimation.log import motion_decisions
-from fgloc.estimation.motion import MotionFaultMonitor, MotionSources, source_difference
+from fgloc.estimation.motion import MotionFaultMonitor, MotionSources, TurnComparison, source_difference
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import predict
 from fgloc.graph.installation import Installation
 from fgloc.graph.joint import fuse
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
+from fgloc.sensors.base import Turn
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.network import JointCalibration
@@ -162,6 +163,17 @@ def test_a_gyro_that_the_model_reads_does_not_enter_again(tmp_path):
         "wheels",
         "gyro",
     ]
+
+
+@pytest.mark.parametrize("reads", ["commands", "gyro"])
+def test_a_model_depends_on_the_scale_of_the_gyro_only_if_it_reads_it(tmp_path, reads):
+    learned = learned_motion(tmp_path, inputs=("commands", "gyro")[: 1 + (reads == "gyro")])
+    settings, installation = Config(), Installation({"gyro.scale": 0.005, "learned.scale": 0.02})
+    sensors = MotionSensors(WheelMotion(settings.wheels), learned, None, Gyro(GyroConfig()))
+    some = MotionSources(settings, sensors, LandmarkFactors(None, installation))
+    found = [some.read(step(k, 0.1)).learned for k in range(30)][-1]
+    assert found is not None
+    assert set(found.depends_on) == ({"learned.scale", "gyro.scale"} if reads == "gyro" else {"learned.scale"})
 
 
 def step(i: int, dt: float, omega=0.0) -> Step:
@@ -324,3 +336,19 @@ def test_a_robot_that_nothing_measures_goes_on_as_the_fixes_had_it():
     assert sigmas[0] < 0.6 * gone(0, 6, 0.5)[0][0]
     _, far = gone(20, 60, 60.0)
     assert far == pytest.approx([1.0, 0.0, 0.0], abs=0.1)  # 0.5 m/s for the time constant
+
+
+# --- turns of gyro and wheels, where nothing fixes the yaw ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("per_m_sigma", "learned"), [(0.1, True), (0.0, False)])
+def test_wheels_of_unequal_size_are_no_slip_to_the_comparison_with_a_gyro(per_m_sigma, learned):
+    """They differ by 0.1 rad/s, of which some is the bias: more than gyros have, but not too much for such wheels."""
+    settings = Config.model_validate({"wheels": {"yaw_per_m_sigma": per_m_sigma}, "gyro": {"bias_sigma": 0.02}})
+    turns, wheels = TurnComparison(settings), says("wheels", [0.1, 0.0, 0.0], np.eye(3) * 1e-8)
+    turned = Turn(0.1 * 0.2, 1e-6, 1e-6)
+    for _ in range(50):
+        turns.compare(0.2, turned, 0.0, wheels)
+    corrected = turns.corrected(turned, 0.2, 0.0, 0.0, 0.02**2)
+    share = 0.02**2 / (0.02**2 + (per_m_sigma * 0.5) ** 2)
+    assert corrected.yaw == pytest.approx(turned.yaw - (share * turned.yaw if learned else 0.0), rel=0.02)

@@ -11,8 +11,9 @@ from robot_world import Chain, World, config, position_error, room
 from test_observation import scene
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import BatchConfig, Config
 from fgloc.frames import quaternion_matrix, rpy_matrix, rpy_quaternion
+from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import INSTALLATION, ground_key
 from fgloc.graph.ground import (
     GRAVITY,
@@ -263,3 +264,14 @@ def test_a_flat_floor_that_may_be_uneven_gives_the_same_place(kind) -> None:
     assert len(estimates) > 15
     assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates[3:]) < 0.05
     assert all(abs(e.ground.z) < 0.1 for e in estimates[3:])
+
+
+def test_a_batch_begins_at_the_height_and_the_tilt_of_each_keyframe() -> None:
+    world = World(room(), seconds=2.0, rate=5)
+    chain = Chain(config(estimator={"ground": "uneven"}), world.map, keep_all=True)
+    estimates = chain.run(world.events())
+    solver = BatchSmoother(chain.localizer.estimator.log, chain.localizer.factors, BatchConfig(), 0.9999)
+    result = solver.result()
+    assert result.ground.shape == (len(estimates), 3)
+    assert np.abs(result.ground).max() < 0.1
+    assert len(np.unique(result.ground[:, 0])) == len(estimates)

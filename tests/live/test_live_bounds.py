@@ -11,6 +11,7 @@ from robot_world import World, beacons, config
 from fgloc.config import Config
 from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.live import Live
+from fgloc.live.run import LiveFacts
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.types import ControlEvent, TransformEvent
 
@@ -48,6 +49,18 @@ def test_frames_of_ever_new_names_take_no_more_memory(static):
             tracemalloc.stop()
         assert kept < KEPT_MB * 1e6
         assert live.status().rejections["transform.too_many_frames"] > MANY
+
+
+def test_a_mounting_that_is_told_again_and_again_is_kept_once():
+    facts = LiveFacts(Config(), None, None)
+    facts.note(transform(0))
+    frames = facts.frames
+    for k in range(1, 5):
+        facts.note(dataclasses.replace(transform(0), stamp_ns=at_ns(k), received_ns=at_ns(k)))
+        assert facts.frames is frames  # there is nothing to build anew
+    moved = dataclasses.replace(transform(0), translation=np.array([0.5, 0.0, 0.0]))
+    facts.note(moved)
+    assert facts.frames is not frames
 
 
 def test_joints_and_topics_of_ever_new_names_make_few_notes_and_statistics():

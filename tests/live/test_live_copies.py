@@ -4,9 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from event_makers import command, odometry
 from live_feed import ROLES, errors, feed, in_order, live_in, received
 from robot_world import START_NS, TURN, World, beacons, config, room
 
+from fgloc.live import Live
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.types import Mode, SightingsEvent
 
@@ -173,3 +175,18 @@ def test_an_imu_of_another_frame_takes_over_once_the_first_is_silent(world):
         made = feed(live, with_imu(world, 4.0, 1, from_s=4.0))
         assert 19 <= live.status().rejections["imu.frame"] <= 21
     assert made[-1].mode is Mode.OK
+
+
+# --- Publishers -------------------------------------------------------------------------------------------------------
+
+
+def test_of_two_publishers_the_first_is_used_until_it_has_been_silent_for_a_second():
+    def odom(k):
+        return odometry(1.0 + 0.25 * k)
+
+    with Live(config(), beacons(), roles=ROLES) as live:
+        used = [bool(live.push(odom(k), "b" if k in (1, 3) else "a")) for k in range(4)]
+        assert used == [True, False, True, False]
+        assert live.status().dropped["odometry"] == 2
+        assert [bool(live.push(odom(k), name)) for k, name in ((6, "b"), (7, "a"), (8, "b"))] == [True, False, True]
+        assert [bool(live.push(e, "c")) for e in (command(3.1), command(3.2))] == [True, True]  # another topic
