@@ -276,6 +276,20 @@ def test_frames_are_aligned_though_some_markers_were_moved():
     assert aligned({}, found) is None
 
 
+@pytest.mark.parametrize("apart_m", [None, 0.1])
+def test_frames_are_aligned_by_the_directions_of_markers_that_hang_too_near_to_one_another(apart_m):
+    motion = np.array([1.0, -2.0, 2.0])
+    known = {0: matrix(standing(0, 3.0, 1.0, np.pi))}
+    if apart_m is not None:
+        known[1] = matrix(standing(1, 3.0, 1.0 + apart_m, np.pi))
+    found = {i: np.linalg.inv(planar_matrix(motion)) @ T for i, T in known.items()}
+    for i, T in found.items():
+        T[:2, 3] += (0.03, -0.03)[i]
+    made = aligned(known, found)
+    assert made[2] == pytest.approx(motion[2], abs=0.02)
+    assert made[:2] == pytest.approx(motion[:2], abs=0.2)
+
+
 def test_frames_are_not_aligned_by_markers_of_which_most_were_moved_by_a_metre():
     rng, known = np.random.default_rng(6), {}
     for i, m in room().landmarks.items():
