@@ -234,6 +234,15 @@ def test_markers_seen_too_seldom_are_left_out_with_the_reason(tmp_path):
     assert np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 0.04
 
 
+def test_markers_whose_place_or_direction_is_hardly_known_are_left_out(tmp_path):
+    bag = write_world(tmp_path, World(room(), seed=1, seconds=6.0, rate=5))
+    made = survey([bag], settings(markers={"sigma_px": 3.0}))
+    sigmas = np.array([np.sqrt(np.diag(m.cov)) for m in made.landmarks.landmarks.values()])
+    assert sigmas[:, :3].max() < 0.1
+    assert sigmas[:, 3:].max() < 0.2
+    assert {1, 6} <= made.left_out.keys()
+
+
 def test_what_is_missing_is_said(bag, tmp_path):
     blind = write_world(tmp_path / "blind", World(room(), seconds=4.0), sightings=False)
     with refusal(RecordingError, blind):

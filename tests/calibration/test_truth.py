@@ -94,6 +94,28 @@ def test_gains_and_noise_of_an_odometer_are_found_with_the_place_and_clock_of_th
     assert all(0.0 < s.sigma < 0.5 * s.prior_sigma for s in listed)
 
 
+def write_bare(folder, truth_m):
+    """An odometer without noise that reports too short a way, and a truth of the base with noise, a little late."""
+    rng, pose, reported = np.random.default_rng(6), np.zeros(3), np.zeros(3)
+    with BagWriter(folder / "bag") as bag:
+        for k in range(920):
+            t, stamp = 0.05 * k, START_NS + k * 50_000_000
+            v, omega = 0.5 + 0.2 * math.sin(0.2 * t), 0.2 * math.sin(0.4 * t)
+            bag.odometry("/odom", stamp, reported.tolist(), (v / 1.05, omega))
+            x, y, yaw = pose + rng.normal(0.0, [truth_m, truth_m, 0.002])
+            bag.truth("/truth", stamp + 20_000_000, (x, y, 0.0), (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)))
+            step = 0.05 * np.array([v, 0.0, omega])
+            pose, reported = se2.compose(pose, se2.exp(step)), se2.compose(reported, se2.exp(step / [1.05, 1.0, 1.0]))
+    return folder / "bag"
+
+
+@pytest.mark.parametrize("truth_m", [0.002, 0.05])
+def test_less_than_a_minute_of_truth_tells_the_odometers_scale_and_the_truths_clock(tmp_path, truth_m):
+    found, _ = calibrate_by_truth([write_bare(tmp_path, truth_m)], GAINS)
+    assert found.wheels.scale_v == pytest.approx(1.05, abs=0.003)
+    assert found.recording.stamp_offset_s["truth"] == pytest.approx(-0.02, abs=0.015)
+
+
 @pytest.mark.parametrize(
     ("told", "n"),
     [(lambda k: k % 16 < 2, 528), (lambda k: not 165 < k < 285, 489)],

@@ -12,7 +12,9 @@ from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.landmark_fits import Mounting, compared, fit_on_map
 from fgloc.diagnosis.landmarks import check_first_pose
 from fgloc.diagnosis.pairs import Figure
-from fgloc.diagnosis.signals import Path, Sightings, Signals
+from fgloc.diagnosis.signals import Path, SightingCollector, Sightings, Signals
+from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.types import Landmark, LandmarkMap
 
 T = np.arange(0.0, 50.0, 0.02)
@@ -75,3 +77,16 @@ def test_a_map_tells_ranges_from_depths_where_the_way_of_a_robot_hardly_does():
     on_map, alone = (compared(path, depths, ranges, MOUNTING, known) for known in (places(), {}))
     assert on_map.value > 3.0 * alone.value > 0.0
     assert on_map.value > 5.0 * on_map.sigma
+
+
+@pytest.mark.parametrize(("distance", "least"), [(0.2, 0.02), (20.0, 0.2)])
+def test_a_sensor_without_noise_still_has_what_wheels_err_by(distance, least):
+    sharp = {"range_sigma_m": 1e-3, "bearing_sigma_rad": 1e-4, "range_scale_sigma": 0.0}
+    config = config_of({"landmarks": sharp | {"bearing_bias_sigma_rad": 0.0}})
+    known = LandmarkMap({1: Landmark(1, np.array([1.0, 0.0, 0.0]), np.eye(3), 0.0)})
+    collector = SightingCollector(config, known, LandmarkSensor(config, known, None, None), np.eye(4))
+    event = RangeBearingEvent(1, 1, "/landmarks", "base_link", (RangeBearing(1, distance, 0.3),))
+    (seen,) = collector.sightings(event, 0.0)
+    assert np.linalg.norm(seen.point) == pytest.approx(distance)
+    assert least <= seen.sigma_m < 2.0 * least
+    assert 0.01 <= seen.sigma_rad < 0.02
