@@ -120,7 +120,8 @@ def test_only_what_is_surely_beyond_the_prior_is_said():
 
 def on_map(moves: dict[int, float], sigma: float = 0.01) -> list[Finding]:
     """Findings on a map whose landmarks a run moves by so much along x, which it knows to a tenth of the prior."""
-    names = {f"map.{i}.{axis}_m": (m, 0.1 * sigma, sigma) for i, by in moves.items() for axis, m in zip("xy", (by, 0.0))}
+    names = {f"map.{i}.x_m": (by, 0.1 * sigma, sigma) for i, by in moves.items()}
+    names |= {f"map.{i}.y_m": (0.0, 0.1 * sigma, sigma) for i in moves}
     landmarks = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), 0.0) for i in moves})
     return contradictions(found(names, landmarks=landmarks), Config())
 
