@@ -15,18 +15,22 @@ from fgloc_datasets.bag import BagWriter
 START_NS, BEAMS, DARK, BRIGHT = 1_700_000_000_000_000_000, 360, 100.0, 900.0
 
 
-def settings(folder, has_map=True, sign=1.0):
-    """Recording of a robot that winds along for 6 s among reflectors."""
-    rng = np.random.default_rng(2)
+def settings(folder, has_map=True, sign=1.0, dark_scans=0, sees=False):
+    """Recording of a robot that winds along for 6 s among reflectors; sooner or later its scans show them."""
+    rng, scans = np.random.default_rng(2), 0
     with BagWriter(folder / "bag") as bag:
         bag.static_transform(START_NS, "base_link", "laser", (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0))
         for k in range(120):
             stamp, yaw = START_NS + k * 50_000_000, 0.3 * math.sin(0.05 * k)
             bag.odometry("/odom", stamp, (0.02 * k, 0.0, yaw), (0.4, sign * 0.3 * math.cos(0.05 * k)))
-            if k % 4 == 0:
+            if sees:
+                bag.range_bearing("/landmarks", stamp, [(1, 3.0, 0.5)])
+            for _ in range(1 + dark_scans // 25 if k % 4 == 0 else 0):
                 intensities = rng.uniform(0.5 * DARK, DARK, BEAMS)
-                intensities[[40, 100, 200, 270]] = BRIGHT
-                bag.laser_scan("/scan", stamp, np.full(BEAMS, 4.0), intensities, (-math.pi, math.pi))
+                if scans >= dark_scans:
+                    intensities[[40, 100, 200, 270]] = BRIGHT
+                bag.laser_scan("/scan", stamp + scans, np.full(BEAMS, 4.0), intensities, (-math.pi, math.pi))
+                scans += 1
     if has_map:
         places = {i: Landmark(i, np.array([i, 3.0, 0.0]), np.eye(3), 0.0) for i in range(4)}
         write_map(LandmarkMap(places), folder / "map.yaml")
@@ -35,6 +39,18 @@ def settings(folder, has_map=True, sign=1.0):
 
 def test_scans_that_only_a_setting_asks_for_are_looked_at(tmp_path):
     assert DARK < settings(tmp_path).reflectors.min_intensity < BRIGHT
+
+
+def test_of_many_scans_that_only_a_setting_asks_for_the_first_are_looked_at(tmp_path):
+    assert settings(tmp_path, dark_scans=500).reflectors.min_intensity is None
+
+
+@pytest.mark.parametrize("has_map", [True, False])
+def test_a_sensor_that_nobody_calibrated_has_wider_priors_where_a_map_can_tell_its_constants(tmp_path, has_map):
+    made, usual = settings(tmp_path, has_map, sees=True).landmarks, Config().landmarks
+    assert made.repeat_s > 0.0
+    for name in ("range_scale_sigma", "bearing_bias_sigma_rad", "position_sigma_m", "time_offset_sigma_s"):
+        assert (getattr(made, name) > getattr(usual, name)) == has_map
 
 
 @pytest.mark.parametrize("has_map", [True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,28 @@ def test_only_what_is_surely_beyond_the_prior_is_said():
     assert finding.lines == {"expert.gyro.scale": "1.03"}
 
 
+def on_map(moves: dict[int, float], sigma: float = 0.01) -> list[Finding]:
+    """Findings on a map whose landmarks a run moves by so much along x, which it knows to a tenth of the prior."""
+    names = {f"map.{i}.x_m": (by, 0.1 * sigma, sigma) for i, by in moves.items()}
+    names |= {f"map.{i}.y_m": (0.0, 0.1 * sigma, sigma) for i in moves}
+    landmarks = LandmarkMap({i: Landmark(i, np.zeros(3), np.eye(3), 0.0) for i in moves})
+    return contradictions(found(names, landmarks=landmarks), Config())
+
+
+def test_landmarks_that_surely_stand_elsewhere_are_named():
+    assert on_map({3: 0.03}) == []  # three sigmas
+    (told,) = on_map({3: 0.04, 4: 0.03})
+    assert told.code == "map.moved"
+    assert re.findall(r"(\d+) \((\d+) mm\)", told.text) == [("3", "40")]
+
+
+@pytest.mark.parametrize(("n", "others"), [(5, []), (7, ["2"])])
+def test_of_many_landmarks_that_stand_elsewhere_those_that_do_most_are_named_and_the_others_counted(n, others):
+    (told,) = on_map({i: 0.1 + 0.01 * i for i in range(n)})
+    assert [int(i) for i, _ in re.findall(r"(\d+) \((\d+) mm\)", told.text)] == [*range(n)][:-6:-1]
+    assert re.findall(r"(\d+) more", told.text) == others
+
+
 def test_pooling_counts_the_prior_once():
     """Three runs that each know as much as the prior: together four times as much."""
     one = found({"wheels.radius": (0.01, 0.01 / np.sqrt(2), 0.01)})  # measured 0.02 ± 0.01
@@ -163,6 +186,15 @@ def _distortion(name: str) -> Setting:
 def _fields(state: InstallationFound) -> dict[str, object]:
     names = ("names", "mean", "cov", "prior_cov", "cameras", "seen_by", "wheels")
     return {name: getattr(state, name) for name in names}
+
+
+def test_a_contradiction_that_one_constant_explains_has_its_line_and_its_value():
+    state = found({"gyro.scale": (0.0, 0.005, 0.005)})
+    rival = Rival(("gyro.scale",), np.array([0.2]), np.array([0.001]), True, 1.0, np.zeros((1, 3)))
+    (finding,) = contradiction_findings(state, Contradiction(("gyro.scale",), state, (rival,)), Config())
+    assert finding.value == pytest.approx(1.2, abs=0.05)
+    assert finding.sigma < 0.01
+    assert float(finding.lines["expert.gyro.scale"]) == pytest.approx(finding.value, abs=1e-3)
 
 
 def test_a_contradiction_of_constants_without_a_setting_names_the_constants():

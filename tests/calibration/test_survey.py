@@ -234,6 +234,15 @@ def test_markers_seen_too_seldom_are_left_out_with_the_reason(tmp_path):
     assert np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 0.04
 
 
+def test_markers_whose_place_or_direction_is_hardly_known_are_left_out(tmp_path):
+    bag = write_world(tmp_path, World(room(), seed=1, seconds=6.0, rate=5))
+    made = survey([bag], settings(markers={"sigma_px": 3.0}))
+    sigmas = np.array([np.sqrt(np.diag(m.cov)) for m in made.landmarks.landmarks.values()])
+    assert sigmas[:, :3].max() < 0.1
+    assert sigmas[:, 3:].max() < 0.2
+    assert {1, 6} <= made.left_out.keys()
+
+
 def test_what_is_missing_is_said(bag, tmp_path):
     blind = write_world(tmp_path / "blind", World(room(), seconds=4.0), sightings=False)
     with refusal(RecordingError, blind):
@@ -274,6 +283,20 @@ def test_frames_are_aligned_though_some_markers_were_moved():
         known[i] = planar_matrix((1.0, 0.5, 1.0)) @ known[i]
     assert np.allclose(aligned(known, found), motion, atol=1e-9)
     assert aligned({}, found) is None
+
+
+@pytest.mark.parametrize("apart_m", [None, 0.1])
+def test_frames_are_aligned_by_the_directions_of_markers_that_hang_too_near_to_one_another(apart_m):
+    motion = np.array([1.0, -2.0, 2.0])
+    known = {0: matrix(standing(0, 3.0, 1.0, np.pi))}
+    if apart_m is not None:
+        known[1] = matrix(standing(1, 3.0, 1.0 + apart_m, np.pi))
+    found = {i: np.linalg.inv(planar_matrix(motion)) @ T for i, T in known.items()}
+    for i, T in found.items():
+        T[:2, 3] += (0.03, -0.03)[i]
+    made = aligned(known, found)
+    assert made[2] == pytest.approx(motion[2], abs=0.02)
+    assert made[:2] == pytest.approx(motion[:2], abs=0.2)
 
 
 def test_frames_are_not_aligned_by_markers_of_which_most_were_moved_by_a_metre():

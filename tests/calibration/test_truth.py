@@ -94,6 +94,39 @@ def test_gains_and_noise_of_an_odometer_are_found_with_the_place_and_clock_of_th
     assert all(0.0 < s.sigma < 0.5 * s.prior_sigma for s in listed)
 
 
+def write_bare(folder, truth_m, truth_rad=0.002, seconds=46.0, rate_hz=20, turn=0.2, seed=6):
+    """An odometer without noise that reports too short a way, and a truth of the base with noise, a little late."""
+    rng, pose, reported, dt = np.random.default_rng(seed), np.zeros(3), np.zeros(3), 1.0 / rate_hz
+    with BagWriter(folder / "bag") as bag:
+        for k in range(round(seconds * rate_hz)):
+            t, stamp = dt * k, START_NS + round(k * dt * 1e9)
+            v, omega = 0.5 + 0.2 * math.sin(0.2 * t), turn * math.sin(0.4 * t)
+            bag.odometry("/odom", stamp, reported.tolist(), (v / 1.05, omega))
+            x, y, yaw = pose + rng.normal(0.0, [truth_m, truth_m, truth_rad])
+            bag.truth("/truth", stamp + 20_000_000, (x, y, 0.0), (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)))
+            step = dt * np.array([v, 0.0, omega])
+            pose, reported = se2.compose(pose, se2.exp(step)), se2.compose(reported, se2.exp(step / [1.05, 1.0, 1.0]))
+    return folder / "bag"
+
+
+def test_the_noise_of_a_truth_does_not_add_up_from_window_to_window(tmp_path):
+    bag = write_bare(tmp_path, 0.03, 0.03, seconds=150.0, rate_hz=10, turn=0.05, seed=4)
+    exact = {f"{what}_per_sqrt_{of}": 1e-3 for what, of in (("x", "m"), ("y", "m"), ("yaw", "m"), ("yaw", "rad"))}
+    config = Config.model_validate({"truth": {"align": "se2"}, "wheels": {"noise": exact | {"xy_per_sqrt_rad": 1e-3}}})
+    found, listed = calibrate_by_truth([bag], config)
+    sigmas = {s.name: s.sigma for s in listed}
+    assert found.wheels.scale_v == pytest.approx(1.05, abs=1e-4)
+    assert found.wheels.yaw_per_m == pytest.approx(0.0, abs=2e-4)
+    assert sigmas["wheels.scale_v"] < 0.0015
+
+
+@pytest.mark.parametrize("truth_m", [0.002, 0.05])
+def test_less_than_a_minute_of_truth_tells_the_odometers_scale_and_the_truths_clock(tmp_path, truth_m):
+    found, _ = calibrate_by_truth([write_bare(tmp_path, truth_m)], GAINS)
+    assert found.wheels.scale_v == pytest.approx(1.05, abs=0.003)
+    assert found.recording.stamp_offset_s["truth"] == pytest.approx(-0.02, abs=0.015)
+
+
 @pytest.mark.parametrize(
     ("told", "n"),
     [(lambda k: k % 16 < 2, 528), (lambda k: not 165 < k < 285, 489)],

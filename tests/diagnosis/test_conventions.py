@@ -238,6 +238,17 @@ def test_a_yaw_rate_is_compared_with_the_odometrys_own_yaw(factor, late_s, codes
     assert found.codes == codes
 
 
+@pytest.mark.parametrize("unit", [1.0 / 3.6, 0.01, FOOT], ids=["km/h", "cm/s", "feet per second"])
+def test_speeds_in_another_unit_than_the_pose_get_the_units_factor(unit):
+    rows = list(zip(*(c[::10].tolist() for c in (TIMES, X, Y, YAW, SPEED / unit, 0.0 * SPEED, RATE)), strict=True))
+    motion = [odometry(t, (x, y, yaw), (v, w)) for t, x, y, yaw, v, _, w in rows]
+    found = Conventions(config_of({"wheels": {"source": "twist"}}), Signals(motion=motion, odometry=rows))
+    check_odometry(found)
+    (told,) = found.findings
+    assert told.code == "odometry.twist_unit"
+    assert float(told.lines["wheels.scale_v"]) == pytest.approx(unit, abs=1e-6)
+
+
 @pytest.mark.slow
 def test_ranges_that_are_said_to_be_depths_and_are_not_are_named(tmp_path):
     bag = record(tmp_path, Broken())
@@ -267,6 +278,18 @@ def test_a_yaw_that_hardly_changes_is_not_said_to_be_the_odometrys(rate, is_name
     found = Conventions(Config(), signals)
     true_body(found, Odometry(t, np.column_stack([x, still, yaw]), np.zeros(len(t), dtype=np.int64), "odometry"))
     assert ("truth.yaw_is_odometry" in found.codes) == is_named
+
+
+@pytest.mark.parametrize(("degrees", "is_named"), [(0.5, False), (1.5, True)])
+def test_a_truth_that_is_tilted_by_less_than_a_degree_is_level(degrees, is_named):
+    some = slice(None, None, 10)
+    t, x, y, yaw = TIMES[some], X[some], Y[some], YAW[some]
+    still = np.zeros(len(t))
+    height = math.tan(math.radians(degrees)) * x
+    rows = list(zip(t, x, y, height, still, still, np.sin(0.5 * yaw), np.cos(0.5 * yaw), strict=True))
+    found = Conventions(Config(), Signals(truth=rows))
+    true_body(found, Odometry(t, np.column_stack([x, y, yaw]), np.zeros(len(t), dtype=np.int64), "odometry"))
+    assert ("truth.tilt" in found.codes) == is_named
 
 
 @pytest.mark.parametrize(("share", "late", "is_named"), [(0.9, 0.2, True), (0.4, 0.2, False), (0.9, 0.02, False)])

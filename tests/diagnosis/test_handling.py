@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from event_makers import command, odometry
 from real_data import real_data
 
 from fgloc import run
@@ -15,8 +16,9 @@ from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.gyro import by_hand
+from fgloc.diagnosis.handling import handling
 from fgloc.diagnosis.mistakes import inspect_all
-from fgloc.diagnosis.signals import read_signals
+from fgloc.diagnosis.signals import Signals, read_signals
 from fgloc.frames import rpy_matrix
 from fgloc.recording.info import RecordingInfo
 from fgloc.recording.reader import open_recording
@@ -145,6 +147,19 @@ def test_in_hands_a_pose_is_not_known(ran) -> None:
     assert sigmas(ran, HELD[1])[2] < 0.1  # the gyro knows how it turned
     assert 0.1 < sigmas(ran, HELD[1])[0] < 1.0
     assert sigmas(ran, LIFTED[1])[0] > 2.0
+
+
+def test_a_gyro_with_a_bias_and_wheels_that_are_silent_for_a_while_are_no_hands() -> None:
+    rng, t = np.random.default_rng(3), np.arange(0.0, 30.0, 0.05)
+    speeds = list(zip(t.tolist(), np.where((t > 10.0) & (t < 20.0), 0.3, 0.0).tolist(), strict=True))
+    wheels = [odometry(s, twist=(v, 0.0)) for s, v in speeds if not 25.0 < s < 27.0]
+    wheels += [command(s, v) for s, v in speeds[::2]]
+    measured = rng.normal([0.0, 0.0, 0.03, 0.0, 0.0, 9.81], 0.003, (len(t), 6))
+    imu = [(s, *row) for s, row in zip(t.tolist(), measured.tolist(), strict=True)]
+    signals, config = Signals(motion=wheels, imu=imu), Config()
+    found = handling(signals, config, signals.path(config), np.array([0.0, 0.0, 1.0]))
+    assert found.spans == ()
+    assert found.gravity == pytest.approx(9.81, abs=0.01)
 
 
 def test_a_robot_that_nobody_touched_is_not_accused(tmp_path) -> None:

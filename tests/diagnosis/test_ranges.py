@@ -9,9 +9,10 @@ import yaml
 from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import config_of, config_of_file
+from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.mistakes import find_mistakes
-from fgloc.diagnosis.ranges import fit_ranges
-from fgloc.diagnosis.signals import Path
+from fgloc.diagnosis.ranges import check_ranges, fit_ranges
+from fgloc.diagnosis.signals import Path, Signals
 from fgloc.sensors.maps import write_map
 from fgloc.types import Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
@@ -51,9 +52,9 @@ def first(bag):
     return {finding.code for finding in made.found}, config_of_file(yaml.safe_load(made.text))
 
 
-@pytest.mark.parametrize("turn", [2.0, 1.0])
-def test_the_turn_of_a_robot_over_its_wheels_is_found_by_ranges(turn):
-    t, rng = np.arange(0.0, 22.0, 0.05), np.random.default_rng(4)
+def ranged(turn, seconds, noise_m):
+    """Path by wheels that report so much less turn than there is, and rows of ranges to the anchors."""
+    t, rng = np.arange(0.0, seconds, 0.05), np.random.default_rng(4)
     omega = 0.9 * np.sin(0.6 * t) + 0.35
     poses, by_wheels = [np.array([1.0, 1.0, 0.2])], [np.zeros(3)]
     for w in omega[:-1]:
@@ -64,12 +65,25 @@ def test_the_turn_of_a_robot_over_its_wheels_is_found_by_ranges(turn):
         (s, 1 + k % 4, math.dist((*p[:2], 0.0), PLACES[1 + k % 4]))
         for k, (s, p) in enumerate(zip(t, poses, strict=True))
     ]
-    rows = [(s, i, r + rng.normal(0.0, NOISE_M)) for s, i, r in rows[::5]]
+    rows = [(s, i, r + rng.normal(0.0, noise_m)) for s, i, r in rows[::5]]
+    return Path(t, np.array(by_wheels), np.zeros(len(t), dtype=np.int64), "odometry"), rows
+
+
+@pytest.mark.parametrize("turn", [2.0, 1.0])
+def test_the_turn_of_a_robot_over_its_wheels_is_found_by_ranges(turn):
+    path, rows = ranged(turn, 22.0, NOISE_M)
     anchors = {i: np.array(place) for i, place in PLACES.items()}
-    path = Path(t, np.array(by_wheels), np.zeros(len(t), dtype=np.int64), "odometry")
     fit = fit_ranges(path, rows, anchors, np.zeros(3), NOISE_M)
     assert fit.turn.value == pytest.approx(turn, rel=0.05)
     assert fit.misfit < 2.0 * NOISE_M
+
+
+@pytest.mark.parametrize(("turn", "is_named"), [(1.3, False), (1.7, True)])
+def test_a_turn_by_the_wheels_that_explains_ranges_nearly_as_well_is_not_refuted(turn, is_named):
+    path, rows = ranged(turn, 22.0, NOISE_M)
+    found = Conventions(config_of({"uwb": {"anchors": PLACES, "sigma_m": 10.0 * NOISE_M}}), Signals(ranges=rows))
+    check_ranges(found, path)
+    assert found.codes == ({"wheels.turn"} if is_named else set())
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from fgloc import se2
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, config_of
-from fgloc.diagnosis.sanity import Placed, Track, Watch, chained, gyro_agrees, judged
+from fgloc.diagnosis.sanity import Placed, Track, Watch, chained, compared, gyro_agrees, judged
 from fgloc.errors import FglocError
 from fgloc.estimation.localizer import Localizer
 from fgloc.evaluation.metrics import compute_metrics
@@ -113,6 +113,13 @@ def test_wheels_that_are_hardly_known_are_no_measure_of_length(sigma, code):
     poses, motions, rng = driven()
     track = dataclasses.replace(track_of(poses, motions, rng, known=False), scale_sigma=sigma)
     assert codes(judged(track, estimates(track, poses * [1.06, 1.06, 1.0]))) == [code]
+
+
+def test_a_landmark_that_was_seen_once_explains_nothing_without_a_map():
+    poses, motions, rng = driven(100)
+    track = track_of(poses, motions, rng, known=False)
+    once = dataclasses.replace(track, ids=np.where(np.arange(len(track.ids)) % 2, 100 + np.arange(len(track.ids)), 1))
+    assert compared(once, poses * [9.0, 9.0, 1.0], None).explained < 0.2
 
 
 def test_poses_that_are_not_finite_are_not_given():

@@ -1,0 +1,26 @@
+"""Comparison of pairs of signals: what two that share little tell of each other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fgloc.diagnosis.pairs import MOST_LAG_S, fit_rate
+from fgloc.diagnosis.signals import Path
+
+
+@pytest.mark.parametrize("late_s", [MOST_LAG_S, -MOST_LAG_S])
+def test_the_longest_lag_is_found_where_two_signals_share_a_few_seconds(late_s):
+    t = np.arange(0.0, 10.0, 0.02)
+
+    def yaw(s):
+        return 0.9 * np.sin(1.3 * s) + 0.3 * np.sin(3.1 * s + 1.0)
+
+    still = np.zeros(len(t))
+    path = Path(t, np.column_stack([still, still, yaw(t)]), np.zeros(len(t), dtype=np.int64), "odometry")
+    fit = fit_rate(path, t, 0.5 * yaw(t - late_s))
+    assert fit.late_s.value == pytest.approx(late_s, abs=0.002)
+    assert fit.share == pytest.approx(1.0, abs=1e-6)
+    assert math.isclose(fit.scale.value, 2.0, rel_tol=0.1)
