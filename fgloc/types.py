@@ -427,6 +427,10 @@ class Mode(StrEnum):
     LOST = "LOST"
 
 
+MOUNTING_CHANGED = "mounting_changed"
+"""Reason of the decision that a sensor was knocked; its kind is that of the sensor's sightings."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
     """Decision on one measurement, or on the pose: a row of ``steps.csv``."""

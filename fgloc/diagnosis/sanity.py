@@ -24,13 +24,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgloc import se2
-from fgloc.config import Config
+from fgloc.config import Config, camera_role
 from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
+    MOUNTING_CHANGED,
     Camera,
     Estimate,
     Finding,
@@ -170,6 +171,7 @@ class Sanity:
             gyro: one of its own, whose bias only rest corrects; None: there is none.
         """
         self._cameras = tuple(cameras)
+        self._of_cameras = {camera_role(camera.name, "corners") for camera in cameras}
         self._place: FloatArray = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
         sensor = LandmarkSensor(config, landmark_map, cameras, T_base_sensor)
         self._collector = SightingCollector(config, landmark_map, sensor, self._place)
@@ -181,6 +183,7 @@ class Sanity:
         self._motions, self._covs, self._turns = array("d"), array("d"), array("d")
         self._seen_ns, self._ids, self._seen = array("q"), array("q"), array("d")
         self._segment, self._last_seen_ns = -1, -_SPARSE_NS
+        self._knocked: set[str] = set()  # kinds of sightings of sensors that are no longer mounted as configured
         self.watch = Watch(landmark_map is not None, config)
 
     def observe(
@@ -197,6 +200,8 @@ class Sanity:
         Returns:
             The estimate, or what is to be given in its place while it fails: the odometry from the last sane pose on.
         """
+        if estimate is not None:
+            self._knocked |= {d.kind for d in estimate.decisions if d.reason == MOUNTING_CHANGED}
         measured = self._wheels.measure(step)
         if measured is None:
             return estimate
@@ -228,6 +233,10 @@ class Sanity:
             self._last_seen_ns = event.stamp_ns
             camera = camera_of(self._cameras, event.topic)
             T = self._place if camera is None else camera.T_base_cam
+            if camera is None and self._knocked - self._of_cameras:
+                continue
+            if camera is not None and camera_role(camera.name, "corners") in self._knocked:
+                continue
             for sighting in self._collector.sightings(event, 0.0):
                 place = (T[:3, :3] @ sighting.point + T[:3, 3])[:2]
                 sigma = math.hypot(sighting.sigma_m, sighting.sigma_rad * math.hypot(place[0], place[1]))

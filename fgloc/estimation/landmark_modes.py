@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.installation import KNOCKED_M, KNOCKED_RAD, InstallationEstimate
+from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
 from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
@@ -82,7 +82,7 @@ def rotation_cov(H: FloatArray, rows: tuple[int, int]) -> FloatArray:
 
 # --- A sensor that was knocked ----------------------------------------------------------------------------------------
 
-_KNOCKED = np.array([KNOCKED_M, KNOCKED_M, KNOCKED_RAD])  # sigma of a mounting's change, in the base's axes
+_KNOCKED = np.array([0.03, 0.03, 0.05])  # m, m, rad: sigma of a mounting's change, in the base's axes
 _WRONG_FROM_THE_START = 1e-4  # probability that a mounting is another one than it was measured to be ...
 _KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards
 _LEVEL = 0.5  # share of a camera's changes that do not tilt it: markers in its images contradict a tilt
@@ -104,9 +104,10 @@ class _Onsets:
         last_ns: stamp of the sensor's last sightings.
     """
 
-    def __init__(self, states: int, unseen: float, first: float) -> None:
+    def __init__(self, states: int, unseen: float, first: float, turned: float) -> None:
         self._unseen = unseen  # share of the changes that the sensor's own sightings do not contradict
-        self._first = first  # prior of the first hypothesis
+        self._first = first  # prior of the first hypothesis, and sigma of its turn
+        self._sigmas = np.array([*_KNOCKED[:2], turned])
         self.M, self.moved = np.zeros((0, states, 3)), np.zeros((0, 3))
         self.information, self.evidence, self.prior = np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
         self.since_ns: list[int] = []
@@ -124,7 +125,8 @@ class _Onsets:
             self._drop(1 + int(np.argmin(self.evidence[1:] + 2.0 * np.log(self.prior[1:]))))
         self.M = np.concatenate([self.M, np.zeros((1, *self.M.shape[1:]))])
         self.moved = np.concatenate([self.moved, np.zeros((1, 3))])
-        self.information = np.concatenate([self.information, np.diag(_KNOCKED**-2.0)[None]])
+        self.information = np.concatenate([self.information, np.diag(self._sigmas**-2.0)[None]])
+        self._sigmas = _KNOCKED
         self.evidence, self.prior = np.append(self.evidence, 0.0), np.append(self.prior, prior)
         self.since_ns.append(stamp_ns)
 
@@ -197,13 +199,14 @@ class MountModes:
         self._states = states
         self._of: dict[str, _Onsets] = {}
         self._taken: tuple[FloatArray, FloatArray, dict[str, FloatArray]] | None = None  # not weighed yet
-        self._first = _WRONG_FROM_THE_START
+        self._seen: dict[str, FloatArray] = {}  # derivatives of each sensor's newest sightings by pose and installation
+        self._first, self._turned = _WRONG_FROM_THE_START, float(_KNOCKED[2])
         self._set_anew = False  # whether the pose was, since the mountings were found to be as they are
 
     def reset(self) -> None:
         """Forget all evidence, as the pose was set anew."""
         self._set_anew = self._set_anew or bool(self._of)
-        self._first = _WRONG_FROM_THE_START
+        self._first, self._turned = _WRONG_FROM_THE_START, float(_KNOCKED[2])
         self._of.clear()
         self._taken = None
 
@@ -219,6 +222,7 @@ class MountModes:
         wide = variance + _KNOCKED[2] ** 2
         evidence = turn**2 / variance - turn**2 / wide - math.log(wide / variance)
         self._first = _TURNED * posterior(_WRONG_FROM_THE_START, evidence)
+        self._turned = max(abs(turn), float(_KNOCKED[2]))
 
     def states_changed(self, added: slice, rows: Sequence[slice]) -> None:
         """Follow `Estimator.give_states`: no change of a mounting has had a part in new states."""
@@ -248,12 +252,14 @@ class MountModes:
         for name in dict.fromkeys(rows):
             if name:
                 unseen = _LEVEL if name.endswith("corners") else 1.0
-                self._of.setdefault(name, _Onsets(self._states, unseen, self._first)).begin(stamp_ns)
+                self._of.setdefault(name, _Onsets(self._states, unseen, self._first, self._turned)).begin(stamp_ns)
         of, by = np.array(rows), dict[str, FloatArray]()
         for name, one in self._of.items():
             G = -(H @ one.M)
             own = of == name
             G[:, own] -= H[own, :3]
+            if own.any():
+                self._seen[name] = H[own]
             G = W @ G
             by[name] = G
             one.M += gain @ G
@@ -297,7 +303,10 @@ class MountModes:
             for k, prior in enumerate(one.prior.tolist()):
                 if (k > 0 or self._set_anew) and posterior(prior, float(one.evidence[k])) > _CERTAIN:
                     off, spread = one.M[k] @ one.moved[k], one.M[k] @ np.linalg.solve(one.information[k], one.M[k].T)
-                    return Changed(name, one.since_ns[k], float(one.evidence[k]), off, spread)
+                    seen, moved = self._seen[name], one.moved[k]
+                    return Changed(
+                        name, one.since_ns[k], float(one.evidence[k]), off, spread, seen, seen[:, :3] @ moved
+                    )
         return None
 
 
@@ -311,6 +320,8 @@ class Changed:
         evidence: twice the log-likelihood ratio to "in place".
         off: ``(3 + n,)`` error that this made in pose and installation.
         spread: ``(3 + n, 3 + n)`` covariance of that.
+        H: ``(d, 3 + n)`` of the sensor's newest sightings by pose and installation.
+        shift: ``(d,)`` of these by the change.
     """
 
     kind: str
@@ -318,6 +329,8 @@ class Changed:
     evidence: float
     off: FloatArray
     spread: FloatArray
+    H: FloatArray
+    shift: FloatArray
 
 
 _SURE, _HARDLY = 1.0 - 1e-12, 1e-300  # probabilities whose odds are finite

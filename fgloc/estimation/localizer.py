@@ -196,6 +196,7 @@ class Localizer:
         if before is not None:
             decisions = [*decisions, place_decision(self.estimator.k + 1, step.stamp_ns, before, place, JUMP)]
             self.tracking.found(before, place)
+        self.estimator.forget_contradictions()
         self.motion.restart()
         self.sightings.restart()
         self._recorder.jumped()

@@ -14,7 +14,7 @@ from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
 from fgloc.sensors import registry
 from fgloc.sensors.measurements import sensor_name
-from fgloc.types import Decision, FloatArray, Grave, Mode, MotionMeasurement, MotionReadings
+from fgloc.types import MOUNTING_CHANGED, Decision, FloatArray, Grave, Mode, MotionMeasurement, MotionReadings
 
 JUMP = "jump"  # reasons of places that the run went to: one that nothing connects with the pose before ...
 OVERRULED = "overruled by sightings"  # ... and one nearby, which the motion did not lead to
@@ -86,7 +86,7 @@ def moved_decision(k: int, stamp_ns: int, landmark_id: int, evidence: float, ala
 
 def mounting_decision(k: int, stamp_ns: int, kind: str, evidence: float) -> Decision:
     """The row for a sensor whose mounting changed, by the kind of its sightings."""
-    return Decision(k, stamp_ns, kind, -1, math.sqrt(evidence), evidence, se2.DOF, 1.0, "mounting_changed")
+    return Decision(k, stamp_ns, kind, -1, math.sqrt(evidence), evidence, se2.DOF, 1.0, MOUNTING_CHANGED)
 
 
 def mode_decisions(k: int, stamp_ns: int, mode: Mode, since_fix_s: float, after_s: float) -> tuple[Decision, ...]:

@@ -474,20 +474,21 @@ class SightingJudge:
         refused = None if seen.elsewhere is not None else self._knocked(seen)
         if refused is None:
             return motion, seen
-        kind, since_ns, nis = refused  # the sightings of this step are judged again
+        kind, since_ns, nis, now = refused  # the sightings of this step are judged again
         row = mounting_decision(self._estimator.k + 1, step.stamp_ns, kind, nis)
-        self._remount(kind, since_ns, self._estimator.newest.belief)
+        self._remount(kind, since_ns, self._estimator.newest.belief, now)
         self.modes.restart()
         seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
         return motion, replace(seen, places=(row,))
 
-    def _knocked(self, seen: JudgedSightings) -> tuple[str, int, float] | None:
+    def _knocked(self, seen: JudgedSightings) -> tuple[str, int, float, InstallationEstimate | None] | None:
         """Sensor all of whose sightings are refused, though another mounting explains those of several images in a row.
 
         A camera that looks up or down now sees what no pose on the floor explains.
 
         Returns:
-            Kind of its sightings, stamp of the first such ones, and the χ² of those in the newest image.
+            Kind of its sightings, stamp of the first such ones, χ² of those in the newest image, and the installation by
+            the images before it.
         """
         if not self._estimator.factors.known or not self._adaptive or self._tracking.keeps_initial_pose:
             return None
@@ -512,11 +513,13 @@ class SightingJudge:
             self._refused[kind] = count + 1, since_ns, found[0].installation
             if count + 1 == _KNOCK_IMAGES:
                 self._association.take_back((m, "gate") for m in own)
-                return kind, since_ns, sum(nis[kind, m.landmark_id] for m in own)
+                return kind, since_ns, sum(nis[kind, m.landmark_id] for m in own), now
         return None
 
-    def _remount(self, kind: str, since_ns: int, belief: PoseWithCovariance) -> None:
-        self._estimator.remount(belief, kind, since_ns)
+    def _remount(
+        self, kind: str, since_ns: int, belief: PoseWithCovariance, now: InstallationEstimate | None = None
+    ) -> None:
+        self._estimator.remount(belief, kind, since_ns, now)
         self._refused.pop(kind, None)
         self._remounted.setdefault(kind, since_ns)
 
@@ -604,5 +607,6 @@ class SightingJudge:
         change = self.modes.mounts.changed()
         if change is None:
             return [], False
-        self._remount(change.kind, change.since_ns, self.modes.take_up(change, belief))
+        without = self._estimator.mounted_anew(self.modes.take_up(change, belief), change.kind, change.H, change.shift)
+        self._remount(change.kind, change.since_ns, without)
         return [mounting_decision(self._estimator.k, step.stamp_ns, change.kind, change.evidence)], True

@@ -15,7 +15,7 @@ from fgloc.config import is_motion_source
 from fgloc.results import RunData
 from fgloc.sensors.measurements import sensor_name
 from fgloc.stats import SURE_SIGMAS
-from fgloc.types import Decision, IntArray, Trajectory
+from fgloc.types import MOUNTING_CHANGED, Decision, IntArray, Trajectory
 
 # --- What a judgement cost or saved -----------------------------------------------------------------------------------
 
@@ -289,7 +289,7 @@ def _named(d: Decision, moved: set[int]) -> tuple[Kind, str] | None:
     if d.kind == "place":
         kind = _OF_PLACES.get(d.reason)
         return None if kind is None else (kind, f"landmark {d.landmark_id}" if d.landmark_id >= 0 else "pose")
-    if d.reason == "mounting_changed":
+    if d.reason == MOUNTING_CHANGED:
         return "mounting_changed", sensor_name(d.kind)
     kind = _OF_SIGHTINGS.get(d.reason)
     if kind == "rejected" and d.landmark_id in moved:

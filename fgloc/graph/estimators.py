@@ -121,6 +121,15 @@ class Estimator(ABC):
         self.factors.estimated = predicted.installation  # sightings are held against the ground as predicted
         return predicted
 
+    def forget_contradictions(self) -> None:
+        """The pose was somewhere else: constants that it had contradicted are what they were before any measurement.
+
+        What was learned of all others at the wrong place is as wrong.
+        """
+        if self.contradicted:
+            self.contradicted.clear()
+            self.factors.estimated = self.installation.prior()
+
     def level(self, motions: Sequence[MotionMeasurement]) -> None:
         """Update roll and pitch by gravity over a step, while no pose is known."""
         if self.installation.ground:
@@ -201,23 +210,44 @@ class Estimator(ABC):
             mean[rows], cov[np.ix_(rows, rows)] = now.mean[rows], now.cov[np.ix_(rows, rows)]
         return PoseWithCovariance(belief.pose, belief.cov, cross, InstallationEstimate(mean, cov))
 
-    def remount(self, belief: PoseWithCovariance, kind: str, since_ns: int) -> None:
+    def remount(
+        self, belief: PoseWithCovariance, kind: str, since_ns: int, now: InstallationEstimate | None = None
+    ) -> None:
         """Go on from another newest pose, as the mounting of a sensor changed: the belief is loosened.
 
         Args:
             belief: pose and installation without what the change has done to them.
             kind: of the sensor's sightings.
             since_ns: stamp of the first of them since then.
+            now: of the installation, if the mounting in it is the one that is known now.
         """
-        self.log.remounted.append(Remounting(kind, since_ns, self.installed.mean))
+        if all(change.kind != kind for change in self.log.remounted):  # later ones improve on the first
+            self.log.remounted.append(Remounting(kind, since_ns, self.installed.mean))
         rows, added = self.installation.mounting(kind)
         self.installation.widen_gate(rows, added)
         for name in [self.installation.names[i] for i in rows]:
             self.contradicted.pop(name, None)
         newest = self.newest
-        newest.belief, self._corrected = self.loosened(belief, kind), self._k
+        newest.belief, self._corrected = self.loosened(belief, kind, now), self._k
         self._begin_at(newest)
         self._adopt(newest.belief)
+
+    def mounted_anew(
+        self, belief: PoseWithCovariance, kind: str, H: FloatArray, shift: FloatArray
+    ) -> PoseWithCovariance:
+        """The belief with another mounting of a sensor, by what the change does to its sightings.
+
+        Args:
+            belief: pose and installation.
+            kind: of the sensor's sightings.
+            H: ``(d, 3 + n)`` of some of them by pose and installation.
+            shift: ``(d,)`` of those by the change.
+        """
+        rows, variances = self.installation.mounting(kind)
+        known, A = belief.installation or self.installed, H[:, 3 + rows]
+        mean = known.mean.copy()
+        mean[rows] += np.linalg.solve(A.T @ A + np.diag(1.0 / variances), A.T @ shift)
+        return PoseWithCovariance(belief.pose, belief.cov, belief.cross, InstallationEstimate(mean, known.cov))
 
     def give_states(self) -> tuple[slice, list[slice]]:
         """Make states of the landmarks of the newest keyframe that are none.

@@ -36,7 +36,7 @@ _EFFECTS = {
     "sightings.time_offset_s": (HEADING,),
 }
 _EFFECTS_OF_CAMERA = {"focal": (LENGTH,), "ry_rad": (HEADING,), "time_offset_s": (HEADING,)}
-KNOCKED_M, KNOCKED_RAD = 0.03, 0.05  # sigmas of what a knock changes of a mounting
+_ANEW_M, _ANEW_RAD = 0.1, 0.3  # sigmas of a mounting that is found anew, about what it was
 _GROUND_SIGMAS = (0.3, 0.15, 0.15)  # m, rad, rad: of a robot somewhere on an uneven floor; ramps of 15° are 0.26 rad
 _SENSORS = ("camera", "cameras", "sightings")  # first part of the names of parameters of what sees landmarks
 _CLOCK_OF_CAMERA, _CLOCK_OF_SIGHTINGS = 11, 2  # row of the clock within its block
@@ -209,7 +209,7 @@ class Installation:
         return rows
 
     def mounting(self, kind: str) -> tuple[IntArray, FloatArray]:
-        """Rows of the mounting of a sensor, and the variance of what a knock does to each.
+        """Rows of the mounting of a sensor, and the variance of each about what it was, if it is found anew.
 
         Args:
             kind: of its sightings (`LandmarkMeasurement.row_kind`).
@@ -217,8 +217,8 @@ class Installation:
         camera, _, made = kind.rpartition("/")
         block, parts = (camera_block(camera), CAMERA[:6]) if made == "corners" else ("sightings", (SENSOR[1], *PLACE))
         names = [name for name in (f"{block}.{part}" for part in parts) if name in self.index]
-        knock = [KNOCKED_RAD if name.endswith("_rad") else KNOCKED_M for name in names]
-        return np.array([self.index[name] for name in names], dtype=np.int64), np.square(knock)
+        anew = [_ANEW_RAD if name.endswith("_rad") else _ANEW_M for name in names]
+        return np.array([self.index[name] for name in names], dtype=np.int64), np.square(anew)
 
     def with_mounting(self, kind: str, name: str) -> Installation:
         """Copy with a knocked camera a second time, as another one of this name: its mounting may be another.
