@@ -487,8 +487,8 @@ class SightingJudge:
         A camera that looks up or down now sees what no pose on the floor explains.
 
         Returns:
-            Kind of its sightings, stamp of the first such ones, χ² of those in the newest image, and the installation by
-            the images before it.
+            Kind of its sightings, stamp of the first such ones, χ² of those in the newest image, and the installation
+            by the images before it.
         """
         if not self._estimator.factors.known or not self._adaptive or self._tracking.keeps_initial_pose:
             return None
