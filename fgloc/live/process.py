@@ -122,7 +122,11 @@ class EstimationProcess:
 
     def wait(self, timeout_s: float | None) -> bool:
         """Wait until everything queued has been used; see `Estimation.wait`."""
-        return bool(self._ask("wait", timeout_s).result())
+        longest_s = None if timeout_s is None else timeout_s + _STATUS_S
+        try:
+            return bool(self._ask("wait", timeout_s).result(longest_s))
+        except TimeoutError:  # it does not even answer
+            return False
 
     def status(self) -> LiveStatus:
         """State of the run, see `Estimation.status`; the last known one if the process is busy or has ended."""

@@ -140,6 +140,7 @@ def test_fault_24_an_estimation_process_that_hangs_is_told(monkeypatch):
         child = live._estimation._child.pid
         os.kill(child, signal.SIGSTOP)
         said = [live.status() for _ in range(2)][-1]
+        assert not live.wait(0.1)
         os.kill(child, signal.SIGCONT)
         assert live.wait(PATIENCE_S)
         after = live.status()
