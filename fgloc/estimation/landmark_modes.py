@@ -88,6 +88,7 @@ _KNOCKS_PER_S = 0.01 / 3600.0  # ... and of a change afterwards
 _LEVEL = 0.5  # share of a camera's changes that do not tilt it: markers in its images contradict a tilt
 _MOST_ONSETS = 8  # of one sensor
 _TURNED = 0.5  # probability that it was the sensor if sightings contradict a gyro
+_MOST_OF_ONE = 8.0  # of the evidence: a keyframe may have what nobody models, as images of a stall all at once
 _CERTAIN = 0.99  # probability from which on the estimator takes a change up
 
 
@@ -99,6 +100,7 @@ class _Onsets:
         moved: ``(k, 3)`` δ.
         information: ``(k, 3, 3)`` on δ.
         evidence: ``(k,)`` twice the log-likelihood ratio to "in place".
+        steady: ``(k,)`` likewise, of which sightings of one keyframe make no more than `_MOST_OF_ONE`.
         prior: ``(k,)`` probability.
         since_ns: stamp of each one's first sightings.
         last_ns: stamp of the sensor's last sightings.
@@ -110,6 +112,7 @@ class _Onsets:
         self._sigmas = np.array([*_KNOCKED[:2], turned])
         self.M, self.moved = np.zeros((0, states, 3)), np.zeros((0, 3))
         self.information, self.evidence, self.prior = np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0)
+        self.steady = np.zeros(0)
         self.since_ns: list[int] = []
         self.last_ns: int | None = None
 
@@ -128,6 +131,7 @@ class _Onsets:
         self.information = np.concatenate([self.information, np.diag(self._sigmas**-2.0)[None]])
         self._sigmas = _KNOCKED
         self.evidence, self.prior = np.append(self.evidence, 0.0), np.append(self.prior, prior)
+        self.steady = np.append(self.steady, 0.0)
         self.since_ns.append(stamp_ns)
 
     def weigh(self, w: FloatArray, G: FloatArray, prior: float, wider: FloatArray) -> None:
@@ -154,6 +158,7 @@ class _Onsets:
             sound = float(_either(sound, float(np.square(root @ w).sum()) + grown, prior))
         self.moved, self.information = self.moved + step, information
         self.evidence = self.evidence + sound - cost
+        self.steady = self.steady + np.minimum(sound - cost, _MOST_OF_ONE)
 
     def _costs(self, gap: FloatArray, G: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Minus twice the log-likelihoods ``(k,)``, the corrections ``(k, 3)`` of δ, and the information after them."""
@@ -167,7 +172,7 @@ class _Onsets:
     def _drop(self, k: int) -> None:
         kept = np.arange(len(self.prior)) != k
         self.M, self.moved, self.information = self.M[kept], self.moved[kept], self.information[kept]
-        self.evidence, self.prior = self.evidence[kept], self.prior[kept]
+        self.evidence, self.prior, self.steady = self.evidence[kept], self.prior[kept], self.steady[kept]
         del self.since_ns[k]
 
 
@@ -301,7 +306,7 @@ class MountModes:
         """
         for name, one in self._of.items():
             for k, prior in enumerate(one.prior.tolist()):
-                if (k > 0 or self._set_anew) and posterior(prior, float(one.evidence[k])) > _CERTAIN:
+                if (k > 0 or self._set_anew) and posterior(prior, float(one.steady[k])) > _CERTAIN:
                     off, spread = one.M[k] @ one.moved[k], one.M[k] @ np.linalg.solve(one.information[k], one.M[k].T)
                     seen, moved = self._seen[name], one.moved[k]
                     return Changed(

@@ -503,6 +503,11 @@ class SightingJudge:
         for kind, own in refused.items():
             if len({m.landmark_id for m in own}) < _KNOCK_LANDMARKS:
                 continue
+            if not seen.accepted:  # else the pose is confirmed, and no other one explains them
+                fit = fit_pose(seen.predicted.pose, own, self._estimator.factors)
+                if fit is not None and fit.is_checked(self._gate):
+                    self._refused.pop(kind, None)
+                    continue
             count, since_ns, now = self._refused.get(kind, (0, own[0].stamp_ns, None))
             loose = self._estimator.loosened(seen.predicted, kind, now)
             assert loose.installation is not None

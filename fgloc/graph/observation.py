@@ -269,13 +269,15 @@ class CornerBatch:
         flow = self._flow(q)
         late = camera[:, 11] - self._offset
         mounted = (q + late[:, None, None] * flow - self._t[:, None]) @ self._R
-        X = mounted - camera[:, None, :3] - _cross(camera[:, None, 3:6], mounted)
+        turned = -_cross(camera[:, None, 3:6], mounted)
+        X = mounted + turned - 0.5 * _cross(camera[:, None, 3:6], turned) - camera[:, None, :3]
         behind = (X[:, :, 2] < MIN_DEPTH_M).any(axis=1)
         # 2. Image, with its derivatives by the point in the camera, (m, 4, 2, 3), and by the lens
         predicted, A, by_lens = self._project(X, camera, by_installation)
         # 3. Derivatives
         # by the point in the base frame at the exposure
-        B = (A - _cross(A, camera[:, None, None, 3:6])) @ self._R.transpose(0, 2, 1)[:, None]
+        across = _cross(A, camera[:, None, None, 3:6])
+        B = (A - across + 0.5 * _cross(across, camera[:, None, None, 3:6])) @ self._R.transpose(0, 2, 1)[:, None]
         by_time = (B @ flow[..., None])[..., 0]
         turn = (late * self._twist[:, 2])[:, None, None]
         B[..., 0], B[..., 1] = B[..., 0] + turn * B[..., 1], B[..., 1] - turn * B[..., 0]  # by that at the stamp
@@ -298,7 +300,7 @@ class CornerBatch:
         assert by_lens is not None
         H: FloatArray = np.empty((n, 4, 2, 18))
         H[..., :3] = -A
-        H[..., 3:6] = _crossed(A, mounted)  # -A (φ x X) by φ
+        H[..., 3:6] = _crossed(A - 0.5 * across, mounted) + 0.5 * _crossed(A, turned)  # A (½ φ x (φ x X) - φ x X) by φ
         H[..., 6:11] = by_lens
         H[..., 11] = by_time
         by_tilt = None  # as the camera turns in its place: its way about the base is less than a millimetre
