@@ -89,6 +89,7 @@ _LEVEL = 0.5  # share of a camera's changes that do not tilt it: markers in its 
 _MOST_ONSETS = 8  # of one sensor
 _TURNED = 0.5  # probability that it was the sensor if sightings contradict a gyro
 _MOST_OF_ONE = 8.0  # of the evidence: a keyframe may have what nobody models, as images of a stall all at once
+_LASTS_NS = 5_000_000_000  # at least, before it is taken up: a robot that is pushed for a while looks alike at first
 _CERTAIN = 0.99  # probability from which on the estimator takes a change up
 
 
@@ -306,6 +307,8 @@ class MountModes:
         """
         for name, one in self._of.items():
             for k, prior in enumerate(one.prior.tolist()):
+                if one.last_ns is None or one.last_ns - one.since_ns[k] < _LASTS_NS:
+                    continue
                 if (k > 0 or self._set_anew) and posterior(prior, float(one.steady[k])) > _CERTAIN:
                     off, spread = one.M[k] @ one.moved[k], one.M[k] @ np.linalg.solve(one.information[k], one.M[k].T)
                     seen, moved = self._seen[name], one.moved[k]
