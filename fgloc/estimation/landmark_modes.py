@@ -204,17 +204,16 @@ class MountModes:
         """Take the number of states beside δ, pose included."""
         self._states = states
         self._of: dict[str, _Onsets] = {}
-        self._taken: tuple[FloatArray, FloatArray, dict[str, FloatArray]] | None = None  # not weighed yet
         self._seen: dict[str, FloatArray] = {}  # derivatives of each sensor's newest sightings by pose and installation
-        self._first, self._turned = _WRONG_FROM_THE_START, float(_KNOCKED[2])
-        self._set_anew = False  # whether the pose was, since the mountings were found to be as they are
+        self._set_anew = False  # whether the pose was, in this run
+        self.reset()
 
     def reset(self) -> None:
         """Forget all evidence, as the pose was set anew."""
         self._set_anew = self._set_anew or bool(self._of)
         self._first, self._turned = _WRONG_FROM_THE_START, float(_KNOCKED[2])
         self._of.clear()
-        self._taken = None
+        self._taken: tuple[FloatArray, FloatArray, dict[str, FloatArray]] | None = None  # not weighed yet
 
     def suspect(self, turn: float, variance: float) -> None:
         """Take a change of a mounting for more probable, as sightings agree on a pose that contradicts a gyro.
@@ -227,7 +226,7 @@ class MountModes:
         """
         wide = variance + _KNOCKED[2] ** 2
         evidence = turn**2 / variance - turn**2 / wide - math.log(wide / variance)
-        self._first = _TURNED * posterior(_WRONG_FROM_THE_START, evidence)
+        self._first = max(_TURNED * posterior(_WRONG_FROM_THE_START, evidence), _WRONG_FROM_THE_START)
         self._turned = max(abs(turn), float(_KNOCKED[2]))
 
     def states_changed(self, added: slice, rows: Sequence[slice]) -> None:

@@ -490,7 +490,7 @@ class SightingJudge:
             Kind of its sightings, stamp of the first such ones, χ² of those in the newest image, and the installation
             by the images before it.
         """
-        if not self._estimator.factors.known or not self._adaptive or self._tracking.keeps_initial_pose:
+        if not (self._adaptive and self._estimator.can_remount) or self._tracking.keeps_initial_pose:
             return None
         nis = {(d.kind, d.landmark_id): d.nis for d in seen.decisions if d.reason == "gate"}
         refused: dict[str, list[LandmarkMeasurement]] = {}
@@ -608,8 +608,12 @@ class SightingJudge:
         return [moved_decision(k, step.stamp_ns, moved, nis, self.modes.alarm)], without is not belief
 
     def _take_up_change(self, step: Step, belief: PoseWithCovariance) -> tuple[list[Decision], bool]:
-        """Likewise for a sensor that was knocked: its mounting is to be found again."""
-        change = self.modes.mounts.changed()
+        """Take back what a knocked sensor did to the newest pose; its mounting is to be found again.
+
+        Returns:
+            As `exclude_moved`.
+        """
+        change = self.modes.mounts.changed() if self._estimator.can_remount else None
         if change is None:
             return [], False
         without = self._estimator.mounted_anew(self.modes.take_up(change, belief), change.kind, change.H, change.shift)

@@ -190,6 +190,11 @@ class Estimator(ABC):
         self._begin_at(newest)
         self._adopt(newest.belief)
 
+    @property
+    def can_remount(self) -> bool:
+        """Whether a mounting may change: not where one graph holds all poses, seen by a camera that stays as it is."""
+        return self.factors.known and self._config.kind != "isam2"
+
     def loosened(
         self, belief: PoseWithCovariance, kind: str, now: InstallationEstimate | None = None
     ) -> PoseWithCovariance:
@@ -221,9 +226,9 @@ class Estimator(ABC):
             since_ns: stamp of the first of them since then.
             now: of the installation, if the mounting in it is the one that is known now.
         """
-        if all(change.kind != kind for change in self.log.remounted):  # later ones improve on the first
-            self.log.remounted.append(Remounting(kind, since_ns, self.installed.mean))
         rows, added = self.installation.mounting(kind)
+        if all(change.kind != kind for change in self.log.remounted):  # later ones improve on the first
+            self.log.remounted.append(Remounting(kind, since_ns, self.installed.mean[rows]))
         self.installation.widen_gate(rows, added)
         for name in [self.installation.names[i] for i in rows]:
             self.contradicted.pop(name, None)

@@ -253,7 +253,7 @@ class LandmarkFactors:
         Args:
             kind: of its sightings.
             name: of the camera since then.
-            before: mean ``(n,)`` of the installation until then; the camera's mounting starts there.
+            before: mean ``(k,)`` of the constants of the mounting until then, which starts there.
         """
         installation = self.installation.with_mounting(kind, name)
         if installation is self.installation:
@@ -265,7 +265,7 @@ class LandmarkFactors:
             known.mean[installation.index[own]] = self._estimated.mean[i]
         first, count = installation.blocks[camera_block(name)]
         known.mean[first : first + count] = self._estimated.mean[rows[0] : rows[0] + count]
-        known.mean[[installation.index[self.installation.names[i]] for i in rows]] = before[rows]
+        known.mean[[installation.index[self.installation.names[i]] for i in rows]] = before
         other.estimated = known
         return other
 

@@ -69,7 +69,7 @@ class Remounting:
     Attributes:
         kind: of its sightings.
         stamp_ns: of the first sightings since then.
-        before: mean ``(n,)`` of the installation until then.
+        before: mean ``(k,)`` of the constants of the mounting until then (`Installation.mounting`).
     """
 
     kind: str

@@ -1,4 +1,4 @@
-"""What is read of a recording's images, and of wheels and gyro about them."""
+"""Excerpts of a recording: some of its images, with wheels and gyro about them."""
 
 from __future__ import annotations
 

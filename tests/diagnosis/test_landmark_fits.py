@@ -1,4 +1,4 @@
-"""What sightings of landmarks tell of a sensor, its map and the first pose, by the wheels' motion."""
+"""Fits of a sensor, its map and the first pose to sightings of landmarks, by the wheels' motion."""
 
 from __future__ import annotations
 

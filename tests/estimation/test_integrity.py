@@ -317,3 +317,14 @@ def test_new_states_of_the_installation_change_nothing_of_what_a_knocked_camera_
     for found, expected in zip(changed.displaced(), as_it_was.displaced(), strict=True):
         for a, b in zip(found, expected, strict=True):
             assert a == pytest.approx(b)
+
+
+def test_a_turn_that_a_gyro_nearly_tells_makes_no_knock_less_probable():
+    def share(turn):
+        modes, H = MountModes(3), np.eye(3)
+        modes.suspect(turn, 1e-4)
+        modes.take(0, H, np.eye(3), np.zeros(3), H.T * 1e-7, ["corners"] * 3)
+        return max(found for _, found, *_ in modes.displaced())
+
+    assert share(0.0) == pytest.approx(5e-5, rel=0.01)
+    assert share(0.2) == pytest.approx(0.25, rel=0.01)

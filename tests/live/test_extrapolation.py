@@ -22,7 +22,7 @@ SECOND = 1_000_000_000
 
 
 def anchored(settings, world, events) -> Extrapolator:
-    """That of a run which has used these events."""
+    """Extrapolator of a run that has used these events."""
     facts = LiveFacts(settings, None, CAMERA)
     for event in events[:20]:
         facts.topic_is_used(event)

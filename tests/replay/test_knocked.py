@@ -82,3 +82,9 @@ def test_a_camera_that_stays_where_it_is_was_not_knocked(tmp_path):
     result = run(bag, tmp_path / "map.yaml", config_of(SETTINGS), "online", check=False)
     assert not [d for d in result.decisions if d.reason == "mounting_changed"]
     assert settled(result)[1] < 3.0
+
+
+def test_one_graph_of_all_poses_has_one_mounting(knocked):
+    settings = config_of(SETTINGS | {"estimator": {"kind": "isam2"}})
+    result = run(knocked, knocked.parent / "map.yaml", settings, "online", check=False)
+    assert not [d for d in result.decisions if d.reason == "mounting_changed"]
