@@ -382,7 +382,7 @@ def installation_of(
     landmark_map: LandmarkMap | None,
     corners: bool,
     has_gyro: bool = False,
-    most: int = MOST_LANDMARKS,
+    most: int | None = None,
     gains: Sequence[str] = ("scale",),
     sensed: Sequence[Parameter] = (),
     cameras: Sequence[str] = ("",),
@@ -398,11 +398,12 @@ def installation_of(
         corners: whether sightings are corners of markers in images; otherwise ranges and bearings, or marker poses.
         has_gyro: whether there is a gyro.
         most: landmarks of a map that are states at a time; of a larger map those that are seen (`Installation.occupy`).
+            Default: `MOST_LANDMARKS`.
         gains: of the learned motion that may differ; none: there is no such motion.
         sensed: parameters of registered sensors.
         cameras: names of the cameras that see corners.
     """
-    rb = config.landmarks
+    rb, most = config.landmarks, MOST_LANDMARKS if most is None else most
     roles = ["wheels", *(["gyro"] if has_gyro else []), *(f"learned.{gain}" for gain in gains)]
     parameters = (*registry.motion_parameters(config, roles), *sensed)
     sigmas = {parameter.name: parameter.sigma for parameter in parameters}

@@ -102,6 +102,14 @@ def test_markers_and_points_of_one_map_take_each_others_rows():
     assert all(made.names[made.landmarks[i][0]] == f"map.{i}.x_m" for i in made.landmarks)
 
 
+def test_forty_landmarks_are_states_all_the_time_and_of_more_forty_at_a_time():
+    few, many = (installation_of(SETTINGS, corridor(n), False) for n in (40, 41))
+    assert len(few.landmarks) == 40
+    assert not few.stateless
+    assert len(many.stateless) == 41
+    assert many.most == 40
+
+
 @pytest.mark.parametrize("kind", ["fixed_lag", "ekf"])
 def test_covariances_along_a_large_map_are_right_with_no_more_states_than_are_allowed(kind):
     landmark_map, found, exact = corridor(4 * MOST), [], []

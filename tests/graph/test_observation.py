@@ -15,6 +15,7 @@ from fgloc.graph.installation import CAMERA, MARKER, PLACE, SENSOR, Installation
 from fgloc.graph.noise import sighting_whitening
 from fgloc.graph.observation import MIN_DEPTH_M, Observations
 from fgloc.sensors.measurements import FrameMeasurement, PixelMeasurement, PointMeasurement
+from fgloc.sensors.uwb import BIAS, SCALE, UwbRange
 from fgloc.types import Camera, Landmark, LandmarkMap
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
@@ -260,6 +261,36 @@ def test_sightings_of_several_kinds_come_back_in_their_order():
     one_by_one = [Observations([m], known, Installation({})).linearize(each[:1], np.zeros(0))[0] for m in mixed]
     for a, b in zip(Observations(mixed, known, Installation({})).linearize(each, np.zeros(0)), one_by_one, strict=True):
         assert a.residual == pytest.approx(b.residual, abs=1e-12)
+
+
+def ranges(n: int = 4) -> tuple[np.ndarray, list[UwbRange]]:
+    """Poses, and a range from each to an anchor."""
+    rng = np.random.default_rng(6)
+    poses = rng.uniform(-2.0, 2.0, (n, 3))
+    anchors, tag = rng.uniform(-4.0, 4.0, (n, 3)), np.array([0.1, -0.2, 0.3])
+    cov = np.array([[0.01]])
+    return poses, [UwbRange(source="uwb", stamp_ns=0, cov=cov, range_m=3.0, anchor=a, tag=tag) for a in anchors]
+
+
+def test_derivatives_of_a_registered_sensor_are_those_of_finite_differences_and_what_is_exact_is_none():
+    poses, seen = ranges()
+    for names in ((SCALE, BIAS), (BIAS,), ()):
+        installation = Installation(dict.fromkeys(names, 0.1))
+        observed = Observations(seen, {}, installation)
+        check(observed, poses, np.full(len(names), 0.05), 1e-4)
+        for one in observed.linearize(poses, np.zeros(len(names))):
+            assert {installation.names[column] for column in one.columns} == set(names)
+
+
+def test_a_range_of_a_registered_sensor_shares_the_noise_of_its_way_to_the_keyframe_and_has_none_at_it():
+    poses, seen = ranges()
+    way, cov = np.array([0.2, 0.1, 0.3]), np.diag([0.01, 0.02, 0.03]) ** 2
+    moved = [m.compensated(way, cov) for m in seen]
+    at, since = (Observations(s, {}, Installation({})).linearize(poses, np.zeros(0)) for s in (seen, moved))
+    for here, later, m, pose in zip(at, since, seen, poses, strict=True):
+        assert here.noise() == pytest.approx(np.eye(1))
+        by_then = m.residual_at(se2.compose(pose, way))[1] / 0.1
+        assert later.noise() == pytest.approx(np.eye(1) + by_then @ cov @ by_then.T, rel=1e-9)
 
 
 def test_beside_the_camera_the_lens_distorts_no_more_than_at_the_edge_of_its_images():
