@@ -818,7 +818,7 @@ class IncrementalEstimator(Estimator):
         if prior is None:
             made = [*self._motion_factors(frame), *self._ground_factors(frame)]
         elif len(known.mean) and self._fresh:
-            made = installed_prior_factor(frame.k, prior, self.installed, constants)
+            made = installed_prior_factor(frame.k, prior, self._on_ground(frame, self.installed), constants)
         else:
             made = [prior_factor(frame.k, prior.pose, prior.cov)]
             if self.installation.ground:

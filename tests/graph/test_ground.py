@@ -8,13 +8,15 @@ import gtsam
 import numpy as np
 import pytest
 from robot_world import Chain, World, config, position_error, room
+from test_graph import break_down, wall_map
 from test_observation import scene
 
 from fgloc import se2
-from fgloc.config import BatchConfig, Config
+from fgloc.config import BatchConfig, Config, EstimatorConfig
 from fgloc.frames import quaternion_matrix, rpy_matrix, rpy_quaternion
 from fgloc.graph.batch import BatchSmoother
-from fgloc.graph.factors import INSTALLATION, ground_key
+from fgloc.graph.estimators import IncrementalEstimator
+from fgloc.graph.factors import INSTALLATION, LandmarkFactors, ground_key
 from fgloc.graph.ground import (
     GRAVITY,
     driven,
@@ -248,6 +250,25 @@ def test_the_configuration_makes_the_state() -> None:
     assert uneven.constants == len(uneven) - 3
     assert set(IMU) < set(uneven.names)
     assert not set(IMU) & set(flat.names)
+
+
+def test_a_window_that_is_built_again_keeps_the_slope_of_each_keyframe() -> None:
+    """The nose rises step by step: a motion is as long in the map as the slope it was driven on has it."""
+    motion = moved([0.1, 0.0, 0.0], reading([0.0, -0.05]))
+    found = []
+    for breaks in (False, True):
+        of = installation()
+        estimator = IncrementalEstimator(EstimatorConfig(), LandmarkFactors(wall_map(), of))
+        estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-4))
+        for k in range(1, 12):
+            if breaks and k == 11:
+                break_down(estimator)
+            belief = estimator.update(k * 10**8, 0.1, [motion])
+        assert estimator.rebuilt == breaks
+        found.append(belief)
+    assert found[0].pose[0] < 1.08
+    np.testing.assert_allclose(found[1].pose, found[0].pose, atol=1e-4)
+    np.testing.assert_allclose(found[1].installation.mean, found[0].installation.mean, atol=1e-4)
 
 
 def test_quaternions_of_roll_pitch_and_yaw() -> None:
