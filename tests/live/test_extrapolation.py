@@ -11,6 +11,7 @@ from motion_models import make_card, make_tensors
 from robot_world import CAMERA, START_NS, TURN, World, config, position_error, room
 
 from fgloc import se2
+from fgloc.live import extrapolation
 from fgloc.live.extrapolation import Extrapolator
 from fgloc.live.run import LiveFacts, OnlineRun
 from fgloc.sensors.gyro import ImuEvent
@@ -21,8 +22,8 @@ from fgloc.types import MotionEvent
 SECOND = 1_000_000_000
 
 
-def anchored(settings, world, events) -> Extrapolator:
-    """Extrapolator of a run that has used these events."""
+def anchored(settings, world, events, most=math.inf) -> Extrapolator:
+    """Extrapolator of a run that has used these events, which is given so many of its keyframes at most."""
     facts = LiveFacts(settings, None, CAMERA)
     for event in events[:20]:
         facts.topic_is_used(event)
@@ -35,7 +36,7 @@ def anchored(settings, world, events) -> Extrapolator:
         if isinstance(passed, MotionEvent):
             poses.add(passed)
         for step, estimate in () if passed is None else run.use(passed):
-            if estimate is not None:
+            if estimate is not None and (most := most - 1) >= 0:
                 poses.anchor(run.anchor(step, estimate))
     return poses
 
@@ -59,6 +60,27 @@ def test_where_wheels_fall_silent_the_gyro_tells_the_turn_for_seconds():
     assert now.stamp_ns - now.keyframe_ns > 3 * SECOND
     assert abs(se2.wrap(now.pose[2] - world.truth(now.stamp_ns)[2])) < 0.02
     assert math.sqrt(now.cov[2, 2]) < 0.05
+
+
+def test_from_the_first_keyframe_on_there_are_poses_and_none_before_it():
+    world = World(room(), seconds=2.0, rate=5)
+    poses = anchored(config(), world, world.events(), most=1)
+    first = poses.pose_at(None).keyframe_ns
+    assert poses.pose_at(first - 1) is None
+    for at_ns in (first, first + SECOND // 2):
+        assert position_error(poses.pose_at(at_ns), world.truth(at_ns)) < 0.1
+
+
+def test_while_no_keyframe_comes_as_many_messages_are_kept_as_may_be(monkeypatch):
+    world = World(room(), seconds=2.0, rate=5)
+    events = world.events()
+    count = sum(isinstance(event, OdometryEvent) for event in events)
+    at_ns, moved = START_NS + 19 * SECOND // 10, {}
+    for most in (10 * count, count, count - 1):
+        monkeypatch.setattr(extrapolation, "_MOST_EVENTS", most)
+        moved[most] = anchored(config(), world, events, most=1).pose_at(at_ns)
+    assert np.array_equal(moved[count].pose, moved[10 * count].pose)
+    assert np.trace(moved[count - 1].cov) > np.trace(moved[count].cov)  # the older half is forgotten
 
 
 @pytest.mark.parametrize("slips", [False, True])

@@ -16,6 +16,8 @@ from fgloc.errors import WireError
 from fgloc.live.wire import node, play
 from fgloc.live.wire.node import Intake
 from fgloc.live.wire.participant import (
+    CLOCK,
+    CLOCK_TYPE,
     Participant,
     Publication,
     Sample,
@@ -283,7 +285,8 @@ def test_events_of_a_recording_arrive_as_they_are(tmp_path, kind):
 def test_timing_is_the_recorded_one(tmp_path):
     path = write_drive(tmp_path / "run", n=40)  # 2 s
     with Participant(DOMAIN) as one, Participant(DOMAIN) as other, Player(path, one) as player:
-        came, clock = [], WireClock(other)
+        came, ticks, clock, opened = [], [], WireClock(other), time.monotonic()
+        other.read(CLOCK, CLOCK_TYPE, ticks.append)
         other.read(
             "/odom", "nav_msgs/msg/Odometry", lambda s: came.append((time.monotonic(), s.source_ns, clock.now_ns()))
         )
@@ -293,6 +296,7 @@ def test_timing_is_the_recorded_one(tmp_path):
         took = time.monotonic() - began
         length_s = player.duration_s
         assert wait_until(lambda: len(came) == 40)
+    assert 10 < len(ticks) <= (time.monotonic() - opened) * 100.0 + 1.0  # of /clock, a hundred a second
     assert length_s / 2.0 - 0.01 < took < length_s  # not faster than asked; slower only on a busy machine
     times, sources, clocks = (np.array(column) for column in zip(*came, strict=True))
     assert (np.diff(sources) == 50_000_000).all()

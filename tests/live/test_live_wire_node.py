@@ -237,7 +237,9 @@ def test_an_odometry_that_is_late_has_its_frame_on_tf_and_bounds_and_state_besid
     """Its stamps are 0.4 s behind the clock; the poses that are kept reach back 0.125 s."""
     topics = {"image": "none", "sightings": "none"}
     config = Config.model_validate({"recording": {"topics": topics}, "estimator": {"initial_pose": (5.0, 2.0, 0.0)}})
-    with Session(config) as session, Participant(DOMAIN) as base:
+    session, made = Session(config), []
+    session.node.subscribe(made.append)
+    with session, Participant(DOMAIN) as base:
         writer = base.writer("/odom", "nav_msgs/msg/Odometry")
         assert wait_until(lambda: writer.readers)
         for k in range(150):  # 3 s
@@ -250,6 +252,7 @@ def test_an_odometry_that_is_late_has_its_frame_on_tf_and_bounds_and_state_besid
             }
             writer.publish(message)
             time.sleep(0.02)
+    assert {ns(message) for _, message in session.heard["/fgloc/pose"]} <= {estimate.stamp_ns for estimate in made}
     assert len(session.heard["/tf"]) > 50
     (last,) = session.heard["/tf"][-1][1].transforms
     t = last.transform.translation
