@@ -224,6 +224,17 @@ def test_a_watch_carries_the_last_sane_pose_on_and_ends_when_the_estimate_is_san
     assert [f.code for f in watch.findings()] == ["sanity.odometry"]
 
 
+def test_a_watch_forgets_what_was_sound_more_than_two_minutes_ago():
+    """After five minutes the estimate is twice as fast as the odometry, for two."""
+    poses, motions, _ = driven(n=2100)
+    given = list(poses[:1500])
+    for motion in motions[1500:]:
+        given.append(se2.compose(given[-1], motion * [2.0, 1.0, 1.0]))
+    _, out = watched(poses, np.array(given), motions, mapped=False)
+    assert all(e.mode is not Mode.DEAD_RECKONING for e in out[:1500])
+    assert out[-1].mode is Mode.DEAD_RECKONING
+
+
 def test_a_watch_is_causal():
     poses, motions, _ = driven()
     given = poses.copy()

@@ -10,6 +10,7 @@ from robot_world import config
 from test_initializer import MOTION, TRUTH, landmark_map, point, seen_point
 
 from fgloc import se2
+from fgloc.estimation.sightings import Association
 from fgloc.estimation.unnamed import AMBIGUOUS, UNMATCHED, Constellations, Naming
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import PoseWithCovariance
@@ -82,6 +83,17 @@ def named(sigmas, *seen, by=PLACES):
 
 def test_a_hit_has_the_name_of_its_beacon():
     assert named((0.05, 0.05, 0.02), PLACES[3], PLACES[0], (0.0, 1.0)) == ([0, 3], [UNMATCHED])
+
+
+def test_hits_without_a_name_are_counted_by_the_reason_and_are_rejected():
+    association = Association(config(), LandmarkFactors(points(*PLACES)))
+    at = PoseWithCovariance(TRUTH, np.diag(np.square((0.05, 0.05, 0.02))))
+    accepted, rejected, decisions = association.judge(1, 10**9, hits(TRUTH, PLACES[3], PLACES[0], (0.0, 1.0)), at)
+    assert sorted(s.measurement.landmark_id for s in accepted) == [0, 3]
+    assert len(rejected) == 1
+    assert [d.reason for d in decisions] == ["", "", UNMATCHED]
+    assert list(association.rejections.values()) == [1]
+    assert next(iter(association.rejections)).endswith(f".{UNMATCHED}")
 
 
 def test_hits_that_are_surely_named_name_those_that_may_be_of_two():

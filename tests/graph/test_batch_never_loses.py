@@ -16,6 +16,7 @@ from fgloc.runner import run
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.sensors.wheels.events import OdometryEvent
+from fgloc.stats import chi2_bound
 from fgloc.types import ControlEvent, Mode
 from fgloc_datasets.bag import BagWriter
 
@@ -38,6 +39,33 @@ def test_without_a_map_likely_sightings_are_kept_and_their_landmarks_are_found()
         np.hypot(*(m.position[:2] - se2.placed(T, world.map.landmarks[i].position[:2]))) for i, m in landmarks.items()
     ]
     assert max(off) < 0.2
+
+
+def test_without_a_map_the_cost_is_that_of_the_graph_and_of_what_is_left_out():
+    world = World(beacons(), seconds=3.0, rate=5)
+    chain = Chain(config(), None, keep_all=True)
+    chain.run(world.events())
+    for probability in (1.0 - 1e-9, 0.5):
+        solver = BatchSmoother(chain.localizer.estimator.log, chain.localizer.factors, BatchConfig(), probability)
+        left_out = sum(len(frame.sightings) - len(solver.accepted[frame.k]) for frame in solver.frames)
+        assert (left_out > 3) == (probability == 0.5)
+        bounds = 0.5 * chi2_bound(probability, 2) * left_out
+        assert solver.cost() == pytest.approx(solver.result().error + bounds, rel=0.05)  # weights settled
+
+
+def test_sightings_that_were_refused_online_are_taken_if_they_fit_the_batch_on_a_map():
+    world = World(beacons(), seconds=3.0, rate=5)
+    for mapped in (True, False):
+        chain = Chain(config(), world.map if mapped else None, keep_all=True)
+        chain.run(world.events())
+        log = chain.localizer.estimator.log
+        frame = [frame for frame in log.keyframes.values() if frame.sightings][-1]
+        frame.sightings, frame.rejected = (), (*frame.rejected, *frame.sightings)
+        solver = BatchSmoother(log, chain.localizer.factors, BatchConfig(), 0.9999)
+        assert not solver.accepted[frame.k]
+        assert solver.reconsider() == mapped
+        assert bool(solver.accepted[frame.k]) == mapped
+        assert not solver.reconsider()  # there are no more
 
 
 def finite(result) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -285,6 +286,20 @@ def test_a_flat_floor_that_may_be_uneven_gives_the_same_place(kind) -> None:
     assert len(estimates) > 15
     assert max(position_error(e, world.truth(e.stamp_ns)) for e in estimates[3:]) < 0.05
     assert all(abs(e.ground.z) < 0.1 for e in estimates[3:])
+
+
+def test_height_and_tilt_are_less_sure_by_the_clock_the_faster_they_change() -> None:
+    world = World(room(), seconds=2.0, rate=5)
+    chain = Chain(config(estimator={"ground": "uneven"}, recording={"clock_sigma_s": 0.1}), world.map, keep_all=True)
+    made = chain.run(world.events())
+    frames = {frame.stamp_ns: frame for frame in chain.localizer.estimator.log.keyframes.values()}
+    for before, now in pairwise(made):
+        was, is_ = (np.array([e.ground.z, e.ground.roll, e.ground.pitch]) for e in (before, now))
+        rates = (is_ - was) / ((now.stamp_ns - before.stamp_ns) * 1e-9)
+        added = frames[now.stamp_ns].ground_clock_cov
+        assert np.linalg.norm(rates) > 0.0
+        np.testing.assert_allclose(np.sqrt(np.diag(added)[2:5]), 0.1 * np.abs(rates), rtol=0.1)
+    assert not frames[made[0].stamp_ns].ground_clock_cov.any()  # nothing tells how fast yet
 
 
 def test_a_batch_begins_at_the_height_and_the_tilt_of_each_keyframe() -> None:
