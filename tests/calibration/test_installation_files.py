@@ -197,6 +197,20 @@ def test_a_contradiction_that_one_constant_explains_has_its_line_and_its_value()
     assert float(finding.lines["expert.gyro.scale"]) == pytest.approx(finding.value, abs=1e-3)
 
 
+def test_one_rival_that_is_no_installation_is_told_otherwise_than_two_that_explain_a_contradiction_alike():
+    state = found({"gyro.scale": (0.0, 0.005, 0.005)})
+    rival = Rival(("gyro.scale",), np.array([2.0]), np.array([0.001]), False, 1.0, np.zeros((1, 3)))
+    other = Rival(("gyro.bias",), np.array([2.0]), np.array([0.001]), False, 1.0, np.zeros((1, 3)))
+    one, two = (
+        contradiction_findings(state, Contradiction(("gyro.scale",), state, rivals), Config())[0]
+        for rivals in ((rival,), (other, rival))
+    )
+    assert not one.lines
+    assert not two.lines
+    assert two.value is None
+    assert not two.text.endswith(one.text.rpartition(")")[2][-40:])
+
+
 def test_a_contradiction_of_constants_without_a_setting_names_the_constants():
     state = found({"gyro.bias": (0.2, 0.001, 0.02)})
     rival = Rival(("gyro.bias",), np.array([0.2]), np.array([0.001]), True, 1.0, np.zeros((1, 3)))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from robot_world import CAMERA
 from typer.testing import CliRunner
 
 from fgloc import cli, se2
@@ -17,7 +18,7 @@ from fgloc.assembly import assemble
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config, load_config, yaml_of
 from fgloc.diagnosis.landmarks import first_pose_sentence
-from fgloc.diagnosis.setup import Change, angle_of, check_fit, correction, mirrored, swapped
+from fgloc.diagnosis.setup import Change, angle_of, by_places, check_fit, correction, gross, mirrored, swapped
 from fgloc.diagnosis.setup_fit import EXTRAS, GRID_S, Motion, Picture, Setup, Stretch, laid, read_excerpt
 from fgloc.diagnosis.signals import clock_sentence, other_clocks
 from fgloc.diagnosis.truth import truth_sentence
@@ -30,7 +31,7 @@ from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import load_map, write_map
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.sensor import roll_over
-from fgloc.types import LandmarkMap
+from fgloc.types import Finding, Landmark, LandmarkMap, Severity
 
 SAMPLES = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"
 SAMPLE = SAMPLES / "installed_run"
@@ -255,6 +256,50 @@ def test_a_mistake_of_the_odometer_has_its_lines_and_its_factor(kind, lines, val
         key: pytest.approx(number, abs=1e-4) if isinstance(number, float) else number for key, number in lines.items()
     }
     assert found.value == (None if value is None else pytest.approx(value))
+
+
+@pytest.mark.parametrize("kind", ["size", "track", "gyro_clock", "focal", "distortion", "mounting", "position"])
+def test_what_an_ordinary_installation_is_off_by_is_no_mistake(kind):
+    given = Setup(Config(), LandmarkMap({}), CAMERA)
+
+    def off(by: float) -> Setup:
+        K, T, D = CAMERA.K.copy(), CAMERA.T_base_cam.copy(), CAMERA.D.copy()
+        if kind == "focal":
+            K[0, 0] *= 1.0 + by
+        elif kind == "distortion":
+            D[0] += by
+        elif kind == "position":
+            T[2, 3] += by
+        elif kind == "mounting":
+            T[:3, :3] = T[:3, :3] @ rpy_matrix(by, 0.0, 0.0)
+        name = "gyro_late_s" if kind == "gyro_clock" else kind
+        extras = np.where(np.array(EXTRAS) == name, by, 0.0)
+        return Setup(Config(), LandmarkMap({}), dataclasses.replace(CAMERA, K=K, T_base_cam=T, D=D), extras=extras)
+
+    assert not gross(Change(kind, off(0.01)), given)
+    assert gross(Change(kind, off(0.12)), given)
+
+
+@pytest.mark.parametrize(
+    ("code", "value", "ids", "position", "size"),
+    [
+        ("map.ids", 1.0, {0, 1}, 3.0, 0.2),
+        ("map.unit", 0.01, {1, 2}, 0.03, 0.2),
+        ("sightings.scale", 2.0, {1, 2}, 3.0, 0.4),
+    ],
+)
+def test_a_map_is_compared_without_the_mistake_that_its_markers_places_show(code, value, ids, position, size):
+    known = {i: Landmark(i, np.array([3.0, 1.0, 0.0]), np.eye(3), 0.2) for i in (1, 2)}
+    _, undone = by_places(Finding(code, "", Severity.ERROR, value=value), LandmarkMap(known))
+    assert undone.landmarks.keys() == ids
+    assert [m.landmark_id for m in undone.landmarks.values()] == sorted(ids)
+    assert all(m.position[0] == pytest.approx(position) for m in undone.landmarks.values())
+    assert all(m.size_m == pytest.approx(size) for m in undone.landmarks.values())
+
+
+def test_a_finding_that_is_none_of_a_map_changes_no_map():
+    known = LandmarkMap({1: Landmark(1, np.zeros(3), np.eye(3), 0.2)})
+    assert by_places(Finding("wheels.sign", "", Severity.ERROR, value=None), known) is None
 
 
 # --- by the messages alone ---

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fgloc.diagnosis.pairs import MOST_LAG_S, fit_rate
+from fgloc.diagnosis.pairs import MOST_LAG_S, best_lag, fit_rate
 from fgloc.diagnosis.signals import Path
 
 
@@ -24,3 +24,10 @@ def test_the_longest_lag_is_found_where_two_signals_share_a_few_seconds(late_s):
     assert fit.late_s.value == pytest.approx(late_s, abs=0.002)
     assert fit.share == pytest.approx(1.0, abs=1e-6)
     assert math.isclose(fit.scale.value, 2.0, rel_tol=0.1)
+
+
+@pytest.mark.parametrize("late_s", [0.123, -0.2768])
+def test_a_lag_is_found_more_finely_than_it_is_tried(late_s):
+    lag, share = best_lag(lambda lags: 1.0 - (lags - late_s) ** 2, MOST_LAG_S)
+    assert lag == pytest.approx(late_s, abs=1e-9)
+    assert share == pytest.approx(1.0, abs=1e-4)
