@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 from world_bags import write_world
 
-from fgloc.calibration.survey import Distance, SurveyGraph, aligned, mirrored, moved_by, planar_matrix, survey
+from fgloc.calibration.survey import Distance, SurveyGraph, aligned, guess, mirrored, moved_by, planar_matrix, survey
 from fgloc.cli import app
 from fgloc.errors import ConfigError, MapError, RecordingError
 from fgloc.evaluation.metrics import match_result
@@ -59,6 +59,16 @@ def errors(landmarks: LandmarkMap, start=START):
         rows.append([*(m.position - (T @ [*true.position, 1.0])[:3]), *turned])
         sigmas.append(np.sqrt(np.diag(m.cov)))
     return np.array(rows), np.array(sigmas)
+
+
+@pytest.mark.parametrize("least", [5, 6])
+def test_a_marker_needs_as_many_views_as_are_asked_for(least):
+    poses = np.array([truth_at(0.1 * k) for k in range(40)])
+    corners = [project(pose, room().landmarks[2]) for pose in poses]
+    rows = [k for k, one in enumerate(corners) if one is not None][:5]
+    seen = [[PixelMeasurement(k, 2, corners[k], SIGMA_PX, CAMERA)] for k in rows]
+    guesses, left_out = guess(poses[rows], seen, {2: SIZE}, least)
+    assert (set(guesses), set(left_out)) == (({2}, set()) if least == 5 else (set(), {2}))
 
 
 def test_places_and_directions_are_found(found):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fgloc.config import config_of
 from fgloc.diagnosis.comparison import Conventions
-from fgloc.diagnosis.landmark_fits import Mounting, compared, fit_on_map
+from fgloc.diagnosis.landmark_fits import Mounting, compared, fit_on_map, fit_sightings
 from fgloc.diagnosis.landmarks import check_first_pose
 from fgloc.diagnosis.pairs import Figure
 from fgloc.diagnosis.signals import Path, SightingCollector, Sightings, Signals
@@ -59,6 +60,16 @@ def test_by_how_much_landmarks_stand_elsewhere_than_on_the_map_is_found(moved_m,
     _, noise = fit_on_map(path_of(), seen_from(), MOUNTING, places(off))
     assert noise.map_m == pytest.approx(expected, abs=0.03)
     assert noise.range_m == pytest.approx(0.02, abs=0.01)
+
+
+def test_heights_that_wander_on_a_flat_floor_are_misfit_of_the_axes():
+    seen = seen_from()
+    flat = Sightings(seen.times[::4], seen.ids[::4], seen.points[::4], True)
+    heights = np.random.default_rng(2).normal(0.0, 0.3, len(flat.times))
+    wandering = replace(flat, points=flat.points + heights[:, None] * [0.0, 0.0, 1.0])
+    level, wild = (fit_sightings(path_of(), some, ["body"])["body"].misfit for some in (flat, wandering))
+    assert level < 0.1
+    assert wild == pytest.approx(math.hypot(level, 0.3), rel=0.1)
 
 
 @pytest.mark.parametrize(("given", "is_named"), [((0.0, 0.0, 0.0), False), ((0.8, -0.3, 0.0), True), (None, False)])
