@@ -19,10 +19,10 @@ from wire import wait_until
 
 from fgloc.errors import OutputError
 from fgloc.live import Live
-from fgloc.live.state import fingerprint, read_state
+from fgloc.live.state import carried_over, fingerprint, read_state
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import Mode
+from fgloc.types import Mode, Step
 
 GAP = (6.0, 9.0)  # s, nothing listens
 
@@ -101,6 +101,15 @@ def test_an_odometry_that_was_set_to_zero_tells_nothing(world, saved, tmp_path):
     assert known_m(notes[0]) is None  # it may be anywhere that it can have driven to
     assert errors(world, made[5:]).max() < 0.1
     assert made[-1].mode is Mode.OK
+
+
+def test_a_robot_that_stood_when_the_state_was_saved_may_drive_meanwhile(saved, world):
+    """Nothing has measured the motion: it is capable of half a metre and half a radian in a second at least."""
+    stood = read_state(saved, fingerprint(world.map)).state.model_copy(update={"fastest": (0.0, 0.0), "odometry": None})
+    belief, _ = carried_over(stood, Step(0, 0, stood.stamp_ns, stood.stamp_ns + 10**9), config(), stood.saved_ns)
+    added = np.sqrt(np.diag(belief.cov - np.array(stood.cov)))
+    assert added == pytest.approx(0.5, rel=0.01)
+    assert np.array_equal(belief.pose, stood.pose)
 
 
 def test_after_a_long_time_the_map_is_searched(world, saved, tmp_path):

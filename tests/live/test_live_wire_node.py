@@ -27,7 +27,7 @@ from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.live import LivePose
 from fgloc.live.wire import node, play
 from fgloc.live.wire.node import Node, Teller
-from fgloc.live.wire.outputs import SPAN_S, OdomFrame, RecentPoses
+from fgloc.live.wire.outputs import SPAN_S, OdomFrame, Outputs, RecentPoses
 from fgloc.live.wire.participant import Participant, Sample
 from fgloc.live.wire.play import Player
 from fgloc.recording.storage import Storage
@@ -320,6 +320,15 @@ def test_a_keyframe_that_moves_the_robot_is_no_motion(late):
 
 def transform(parent, child, x, static=False):
     return TransformEvent(1, 1, "/tf", parent, child, np.array([x, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0]), static)
+
+
+def test_the_map_is_told_to_those_that_come_later():
+    landmarks, drawn = load_map(SAMPLE / "map.yaml"), []
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        outputs = Outputs(one)
+        outputs.map(landmarks)
+        other.read("/fgloc/map", "visualization_msgs/msg/MarkerArray", drawn.append, latched=True)
+        assert wait_until(lambda: drawn)
 
 
 def test_the_transform_to_the_base_is_the_odometry_frame():
