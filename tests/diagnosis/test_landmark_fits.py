@@ -101,3 +101,12 @@ def test_a_sensor_without_noise_still_has_what_wheels_err_by(distance, least):
     assert np.linalg.norm(seen.point) == pytest.approx(distance)
     assert least <= seen.sigma_m < 2.0 * least
     assert 0.01 <= seen.sigma_rad < 0.02
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_a_scale_beyond_any_unit_of_length_is_not_known(factor):
+    seen = seen_from()
+    tiny = Sightings(seen.times[::4], seen.ids[::4], factor * seen.points[::4], False)
+    found = fit_sightings(path_of(), tiny, ["body"])["body"]
+    assert found.scale.sigma == found.yaw.sigma == found.late_s.sigma == math.inf
+    assert 1e-5 < found.scale.value < 1e5
