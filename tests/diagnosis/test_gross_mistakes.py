@@ -110,6 +110,18 @@ def test_fault_40_wrong_marker_size(looked, factor):
     assert next(iter(found.landmark_map.landmarks.values())).size_m == pytest.approx(0.2, rel=0.02)
 
 
+@pytest.mark.parametrize(("stretches", "is_named"), [(1, False), (3, True)])
+def test_a_mistake_is_named_only_where_the_excerpt_surely_shows_it(looked, stretches, is_named):
+    larger = {
+        i: dataclasses.replace(m, position=1.12 * m.position, size_m=1.12 * m.size_m)
+        for i, m in looked.landmarks.landmarks.items()
+    }
+    some = dataclasses.replace(looked.excerpt, pictures=looked.excerpt.pictures[:stretches])
+    checked = looked.check(landmarks=dataclasses.replace(looked.landmarks, landmarks=larger), excerpt=some)
+    assert checked.fit is not None
+    assert (checked.correction is not None) == is_named
+
+
 def test_fault_40_calibration_of_another_resolution(looked):
     K = looked.camera.K * [[2.0], [2.0], [1.0]]
     found = looked.check(camera=dataclasses.replace(looked.camera, K=K)).correction
