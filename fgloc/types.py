@@ -261,6 +261,14 @@ def camera_of(cameras: Iterable[Camera], topic: str) -> Camera | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Board:
+    """A rigid board of markers: they are displaced together, as the board is."""
+
+    cov: FloatArray | None  # (6, 6) of its position in the map frame and its rotation about its own axes; None: unknown
+    sigma_m: float  # of each marker's place on the board, along each axis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Landmark:
     """A marker or beacon of the map.
 
@@ -275,6 +283,8 @@ class Landmark:
     cov: FloatArray | None = None
     """Of x, y ``(2, 2)``, of x, y, z ``(3, 3)`` in the map frame, or ``(6, 6)`` of these and the rotation [rad] about
     the marker's own axes; None: not known."""
+    board: tuple[Board, FloatArray] | None = None
+    """The board that it is on, and the derivative ``(6, 6)`` of its pose by the board's, each as ``cov`` has them."""
 
     @property
     def is_point(self) -> bool:

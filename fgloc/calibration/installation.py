@@ -292,7 +292,7 @@ def map_found(landmark_map: LandmarkMap, installation: Installation, belief: Ins
         place = landmark.position.copy()
         place[: min(count, 3)] += mean[:3]
         turned = landmark.rotation @ rotation_of(mean[3:]) if count == len(MARKER) else landmark.rotation
-        moved[i] = replace(landmark, position=place, rotation=turned, cov=_readable(cov))
+        moved[i] = replace(landmark, position=place, rotation=turned, cov=_readable(cov), board=None)
     return replace(landmark_map, landmarks=moved, notes=())
 
 

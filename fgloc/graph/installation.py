@@ -96,6 +96,7 @@ class Installation:
         effects: Mapping[str, Sequence[str]] | None = None,
         length: Sequence[str] = (),
         gates: Mapping[str, float] | None = None,
+        boards: Sequence[tuple[Sequence[int], FloatArray]] = (),
     ) -> None:
         """Set prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
 
@@ -107,6 +108,7 @@ class Installation:
             effects: as the attribute; default: none is known.
             length: likewise.
             gates: likewise.
+            boards: markers ``(k,)`` of each board, and the covariance ``(6 k, 6 k)`` of their places together.
         """
         blocks = {_block(name) for name, s in parameters.items() if s > 0.0} - {""}
         blocks |= {f"map.{i}" for i in landmark_cov or {}}
@@ -140,6 +142,12 @@ class Installation:
                 first, count = self.landmarks[landmark_id]
                 n = min(count, len(cov))
                 self._prior_cov[first : first + n, first : first + n] = cov[:n, :n]
+        self._boards = boards
+        for ids, cov in boards:
+            held = [(i, j) for j, i in enumerate(ids) if self.landmarks.get(i, (0, 0))[1] == len(MARKER)]
+            rows = [self.landmarks[i][0] + r for i, _ in held for r in range(len(MARKER))]
+            of = [len(MARKER) * j + r for _, j in held for r in range(len(MARKER))]
+            self._prior_cov[np.ix_(rows, rows)] = cov[np.ix_(of, of)]
         self.sigmas = np.sqrt(np.diag(self._prior_cov))
         self._prior_mean = np.zeros(len(kept))
 
@@ -278,7 +286,7 @@ class Installation:
             for i, cov in chosen.items()
             for name, v in zip(MARKER, np.diag(cov).tolist(), strict=False)
         }
-        other = Installation(own | places | ground, chosen, self.effects, self.length, self.gates)
+        other = Installation(own | places | ground, chosen, self.effects, self.length, self.gates, self._boards)
         rows = [other.index[self.names[i]] for i in kept]
         other._prior_cov[np.ix_(rows, rows)] = self._prior_cov[np.ix_(kept, kept)]
         other._prior_mean[rows] = self._prior_mean[kept]
@@ -430,10 +438,14 @@ def installation_of(
     by_id = dict(sorted(landmark_map.landmarks.items()))
     places = {i: _landmark_sigmas(landmark, config, corners) for i, landmark in by_id.items()}
     given = {i: landmark.cov for i, landmark in by_id.items() if landmark.cov is not None}
+    boards = _boards(by_id.values(), config)
+    given |= {i: cov[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for ids, cov in boards for j, i in enumerate(ids)}
     if len(by_id) <= most:
         sigmas |= {f"map.{i}.{name}": v for i, place in places.items() for name, v in place.items()}
-        return Installation(sigmas | ground, given, effects, length, gates)
-    made = Installation(sigmas | ground, None, effects, length, gates)
+        return Installation(sigmas | ground, given, effects, length, gates, boards)
+    # one by one markers of a board would tell more of it than they know together
+    given |= {i: len(ids) * given[i] for ids, _ in boards for i in ids}
+    made = Installation(sigmas | ground, None, effects, length, gates, boards)
     made.stateless = {
         i: _prior(place, given.get(i)) for i, place in places.items() if i in given or any(place.values())
     }
@@ -442,6 +454,24 @@ def installation_of(
     while made.stateless and made.vacancies < (most if whole else min(most, _SLOTS)):
         made.grow()
     return made
+
+
+def _boards(landmarks: Iterable[Landmark], config: Config) -> list[tuple[list[int], FloatArray]]:
+    """Markers of each board that is not known exactly, and the covariance ``(6 k, 6 k)`` of their places together."""
+    m, r = config.map.position_sigma_m, config.map.rotation_sigma_rad
+    on: dict[int, list[Landmark]] = {}
+    for landmark in landmarks:
+        if landmark.board is not None and landmark.size_m > 0.0 and (m > 0.0 or landmark.board[0].cov is not None):
+            on.setdefault(id(landmark.board[0]), []).append(landmark)
+    found = []
+    for members in on.values():
+        pairs = [one.board for one in members if one.board is not None]
+        board, A = pairs[0][0], np.vstack([lever for _, lever in pairs])
+        cov = np.diag([m**2] * 3 + [r**2] * 3) if board.cov is None else board.cov
+        least = max(board.sigma_m, _HELD)
+        own = np.diag(np.tile([least**2] * 3 + [_HELD**2] * 3, len(members)))
+        found.append(([one.landmark_id for one in members], A @ cov @ A.T + own))
+    return found
 
 
 def _landmark_sigmas(landmark: Landmark, config: Config, corners: bool) -> dict[str, float]:

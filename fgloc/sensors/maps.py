@@ -12,13 +12,22 @@ Our format, all in metres and radians::
       - {id: 8, position: [3.0, 0.0, 0.5], facing: 0, sigma_m: 0.005, sigma_rad: 0.01}  # how well it is known
 
 ``rpy`` and ``quaternion`` turn the marker frame into the map's: x to the marker's right as seen, y to its top, z out of
-its face. Without any turn a marker lies on the floor, face up, its right along the map's x. Sigmas: `map_sigmas`.
+its face. Without any turn a marker lies on the floor, face up, its right along the map's x. Sigmas: `read_cov`.
+
+A rigid board of markers is one entry, placed as a marker is; its markers are displaced together::
+
+    boards:
+      - {kind: aruco_grid, columns: 5, rows: 7, size: 0.04, gap: 0.01, first_id: 0, position: [2, 0, 0.5], facing: 0}
+      - {kind: charuco, columns: 5, rows: 7, square: 0.04, size: 0.03, position: [0, 2, 0.5], facing: 0}
+      - {kind: bundle, position: [0, 0, 2], quaternion: [1, 0, 0, 0], markers: [{id: 9, position: [-0.1, 0, 0]}]}
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from fgloc.config import Config
@@ -27,7 +36,7 @@ from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
 from fgloc.frames import quaternion_matrix, rotation_of, rpy_matrix
 from fgloc.sensors.markers.detector import load_dictionary
-from fgloc.types import MAX_LANDMARK_ID, FloatArray, Grave, Landmark, LandmarkMap
+from fgloc.types import MAX_LANDMARK_ID, Board, FloatArray, Grave, Landmark, LandmarkMap
 
 KEYS = ("cov", "sigma_m", "sigma_rad")
 _OF = {2: "x, y", 3: "x, y, z", 6: "x, y, z and the rotation about the marker's axes"}
@@ -97,6 +106,8 @@ _MAX_BYTES = 5_000_000  # some 50 000 landmarks, 15 s to read; a building has hu
 _MAX_SIZE_M = 5.0
 _MAX_POSITION_M = 1e6
 _QUATERNION_TOLERANCE = 0.05
+_MARKER_ON_BOARD_M = 5e-4  # sigma of a marker's place on a printed board
+_MOST_ON_BOARD = 100  # columns or rows
 _ORIENTATIONS = ("facing", "rpy", "quaternion")
 _WPILIB_SIZE_M = 0.1651  # 6.5 inches, FRC since 2024
 _WPILIB_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # our axes in WPILib's: x out of the face
@@ -105,6 +116,16 @@ _WPILIB_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # 
 def _ids(dictionary: str) -> int:
     """Number of ids of a marker dictionary."""
     return len(load_dictionary(dictionary).bytesList)
+
+
+def _id(item: Item) -> int:
+    """Id of a landmark."""
+    number = item.integer()
+    if number < 0:
+        raise item.fail(f"landmark id {number} is negative; ids count from 0")
+    if number > MAX_LANDMARK_ID:
+        raise item.fail(f"landmark id {number:g} is too large; expected at most {MAX_LANDMARK_ID}")
+    return number
 
 
 class _Builder:
@@ -125,25 +146,38 @@ class _Builder:
         size: Item | None = None,
         cov: FloatArray | None = None,
     ) -> None:
-        """Add a marker, or a point if it has no rotation."""
-        number = landmark_id.integer()
-        if number < 0:
-            raise landmark_id.fail(f"landmark id {number} is negative; ids count from 0")
-        if number > MAX_LANDMARK_ID:
-            raise landmark_id.fail(f"landmark id {number:g} is too large; expected at most {MAX_LANDMARK_ID}")
-        if number in self._lines:
-            raise item.fail(f"landmark id {number} is already in line {self._lines[number]}; every id may stand once")
-        if (np.abs(position) > _MAX_POSITION_M).any():
-            raise item.fail(f"position {position.tolist()} is out of bounds; expected metres")
+        """Add a marker, or a point if it has no rotation, in the file's units."""
+        number = _id(landmark_id)
         if rotation is None and size is not None:
             raise size.fail(f"landmark {number} has a size but no orientation; give one of {', '.join(_ORIENTATIONS)}")
-        position = self.scale * position
-        if cov is not None:
-            units = np.append(np.full(min(len(cov), 3), self.scale), np.ones(max(len(cov) - 3, 0)))
-            cov = cov * np.outer(units, units)
-        side = 0.0 if rotation is None else self.size(size) if size is not None else self.default_size_m or 0.0
+        side = 0.0 if rotation is None else self.side(size)
+        turned = np.eye(3) if rotation is None else rotation
+        self.place(item, Landmark(number, self.metres(position, item), turned, side, self.covariance(cov)))
+
+    def place(self, item: Item, landmark: Landmark) -> None:
+        """Add a landmark; its id may stand once."""
+        number = landmark.landmark_id
+        if number in self._lines:
+            raise item.fail(f"landmark id {number} is already in line {self._lines[number]}; every id may stand once")
         self._lines[number] = item.line
-        self.landmarks[number] = Landmark(number, position, np.eye(3) if rotation is None else rotation, side, cov)
+        self.landmarks[number] = landmark
+
+    def metres(self, position: FloatArray, item: Item) -> FloatArray:
+        """Position of an entry [m]."""
+        if (np.abs(position) > _MAX_POSITION_M).any():
+            raise item.fail(f"position {position.tolist()} is out of bounds; expected metres")
+        return self.scale * position
+
+    def covariance(self, cov: FloatArray | None) -> FloatArray | None:
+        """Covariance of an entry in metres."""
+        if cov is None:
+            return None
+        units = np.append(np.full(min(len(cov), 3), self.scale), np.ones(max(len(cov) - 3, 0)))
+        return cov * np.outer(units, units)
+
+    def side(self, size: Item | None) -> float:
+        """Side of a marker [m]: the file's, else the default; 0 if there is none."""
+        return self.default_size_m or 0.0 if size is None else self.size(size)
 
     def size(self, item: Item) -> float:
         """Side of a marker [m] that the file gives."""
@@ -190,12 +224,14 @@ def load_map(
         return _tagslam(path, root, bodies, builder)
     if tags is not None:
         return _wpilib(path, root, tags, builder)
-    if landmarks is None:
+    if landmarks is None and root.get("boards") is None:
         raise root.fail(
-            "no map in it: expected 'landmarks' (ours), 'bodies' (TagSLAM) or 'tags' (WPILib), "
+            "no map in it: expected 'landmarks' or 'boards' (ours), 'bodies' (TagSLAM) or 'tags' (WPILib), "
             f"got the keys {', '.join(k for k, _ in root.pairs())}"
         )
-    return _columns(path, root, landmarks, builder) if landmarks.is_mapping else _ours(path, root, landmarks, builder)
+    if landmarks is not None and landmarks.is_mapping:
+        return _columns(path, root, landmarks, builder)
+    return _ours(path, root, builder)
 
 
 def configured_map(path: Path, config: Config, default_size_m: float | None = None) -> LandmarkMap:
@@ -230,9 +266,9 @@ def write_map(landmark_map: LandmarkMap, path: Path) -> None:
         file.write("\n".join(lines) + "\n")
 
 
-def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> LandmarkMap:
-    root.only("dictionary", "size", "landmarks")
-    named, size = root.get("dictionary"), root.get("size")
+def _ours(path: Path, root: Item, builder: _Builder) -> LandmarkMap:
+    root.only("dictionary", "size", "landmarks", "boards")
+    named, size, landmarks, boards = (root.get(key) for key in ("dictionary", "size", "landmarks", "boards"))
     dictionary = "" if named is None else named.text()
     if named is not None:
         try:
@@ -241,24 +277,103 @@ def _ours(path: Path, root: Item, landmarks: Item, builder: _Builder) -> Landmar
             raise named.fail(str(error)) from error
     if size is not None:
         builder.default_size_m = builder.size(size)
-    for item in landmarks.entries():
+    for item in [] if boards is None else boards.entries():
+        _board(item, builder)
+    for item in [] if landmarks is None else landmarks.entries():
         item.only("id", "position", "size", *KEYS, *_ORIENTATIONS)
-        position = item.need("position").numbers(2, 3)
-        given = [(key, value) for key in _ORIENTATIONS if (value := item.get(key)) is not None]
-        if len(given) > 1:
-            raise item.fail(f"orientation given {len(given)} times, as {', '.join(k for k, _ in given)}; give one")
-        if given and len(position) == 2:
-            raise item.fail("a marker with an orientation needs a position of x, y, z")
-        rotation = _orientation(*given[0]) if given else None
-        builder.add(
-            item,
-            item.need("id"),
-            np.append(position, 0.0)[:3],
-            rotation,
-            item.get("size"),
-            read_cov(item, rotation is not None),
-        )
+        position, rotation = _placed(item)
+        cov = read_cov(item, rotation is not None)
+        builder.add(item, item.need("id"), position, rotation, item.get("size"), cov)
     return builder.finish(path, root, dictionary, [])
+
+
+def _placed(item: Item) -> tuple[FloatArray, FloatArray | None]:
+    """Position ``(3,)`` of an entry in the file's units, and its rotation ``(3, 3)``; None: it has none."""
+    position = item.need("position").numbers(2, 3)
+    given = [(key, value) for key in _ORIENTATIONS if (value := item.get(key)) is not None]
+    if len(given) > 1:
+        raise item.fail(f"orientation given {len(given)} times, as {', '.join(k for k, _ in given)}; give one")
+    if given and len(position) == 2:
+        raise item.fail("a marker with an orientation needs a position of x, y, z")
+    return np.append(position, 0.0)[:3], _orientation(*given[0]) if given else None
+
+
+def _board(item: Item, builder: _Builder) -> None:
+    """Add the markers of a board: its pose is of its middle, of a bundle of the frame that its markers are placed in.
+
+    Source of the geometry of the printed ones: OpenCV's GridBoard and CharucoBoard.
+    """
+    kinds: dict[str, tuple[tuple[str, ...], Callable[[Item, _Builder], Iterator[_Member]]]] = {
+        "aruco_grid": (("columns", "rows", "size", "gap", "first_id"), _printed),
+        "charuco": (("columns", "rows", "square", "size", "first_id", "legacy"), _printed),
+        "bundle": (("markers",), _bundled),
+    }
+    kind = item.need("kind")
+    if kind.text() not in kinds:
+        raise kind.fail(f"board of kind '{kind.text()}', expected one of {', '.join(kinds)}")
+    keys, members = kinds[kind.text()]
+    item.only("kind", "position", "markers_sigma_m", *KEYS, *_ORIENTATIONS, *keys)
+    given, cov = item.get("markers_sigma_m"), read_cov(item, turned=True)
+    sigma = _MARKER_ON_BOARD_M if given is None else given.number()
+    if given is not None and sigma <= 0.0:
+        raise given.fail(f"sigma {sigma:g}, expected more than 0")
+    if cov is not None and len(cov) < 6:
+        raise item.fail(
+            "sigmas of a board without its rotation; give sigma_m and sigma_rad, a cov of 6 by 6, or neither"
+        )
+    board = Board(builder.covariance(cov), sigma)
+    position, turned = _placed(item)
+    origin, rotation = builder.metres(position, item), np.eye(3) if turned is None else turned
+    for entry, number, size_m, place, R_board_marker in members(item, builder):
+        along = rotation @ place
+        lever = np.eye(6)
+        lever[:3, 3:] = np.cross(rotation.T, along).T
+        lever[3:, 3:] = R_board_marker.T
+        marker = Landmark(number, origin + along, rotation @ R_board_marker, size_m, board=(board, lever))
+        builder.place(entry, marker)
+
+
+_Member = tuple[Item, int, float, FloatArray, FloatArray]
+"""Entry, id, side [m], position (3,) [m] and rotation (3, 3) of a marker on its board."""
+
+
+def _printed(item: Item, builder: _Builder) -> Iterator[_Member]:
+    """Markers of a grid or a chessboard of OpenCV, whose frame has y down and z into the board."""
+    shape = item.need("columns").integer(), item.need("rows").integer()
+    named, kept = item.get("first_id"), item.get("legacy")
+    first = 0 if named is None else _id(named)
+    if not all(1 <= n <= _MOST_ON_BOARD for n in shape):
+        raise item.fail(f"board of {shape[0]} columns and {shape[1]} rows, expected 1 to {_MOST_ON_BOARD} of each")
+    side = builder.side(item.get("size"))
+    codes = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)  # the geometry is the same for all
+    ids = np.arange(first, first + shape[0] * shape[1], dtype=np.int32)
+    try:
+        if item.need("kind").text() == "charuco":
+            square = builder.size(item.need("square"))
+            chess = cv2.aruco.CharucoBoard(shape, square, side, codes, ids[: shape[0] * shape[1] // 2])
+            chess.setLegacyPattern(kept is not None and kept.text().lower() == "true")
+            board: cv2.aruco.Board = chess
+        else:
+            board = cv2.aruco.GridBoard(shape, side, builder.size(item.need("gap")), codes, ids)
+    except (cv2.error, SystemError) as error:
+        raise item.fail(f"OpenCV has no such board: {error}") from error
+    middle = 0.5 * np.array(board.getRightBottomCorner())
+    for number, corners in zip(np.ravel(board.getIds()).tolist(), board.getObjPoints(), strict=True):
+        yield item, number, side, (np.mean(corners, axis=0) - middle) * [1.0, -1.0, 1.0], np.eye(3)
+
+
+def _bundled(item: Item, builder: _Builder) -> Iterator[_Member]:
+    for entry in item.need("markers").entries():
+        entry.only("id", "position", "size", *_ORIENTATIONS)
+        position, turned = _placed(entry)
+        rotation = np.eye(3) if turned is None else turned
+        yield (
+            entry,
+            _id(entry.need("id")),
+            builder.side(entry.get("size")),
+            builder.metres(position, entry),
+            rotation,
+        )
 
 
 def _columns(path: Path, root: Item, landmarks: Item, builder: _Builder) -> LandmarkMap:
