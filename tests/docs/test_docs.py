@@ -109,7 +109,7 @@ def test_every_piece_of_yaml_loads(page, tmp_path):
             continue
         if re.search(r"^recordings:", block.text, re.M):
             assert load_suite(path).recordings
-        elif re.search(r"^landmarks:\n", block.text, re.M):
+        elif re.search(r"^(landmarks|boards):\n", block.text, re.M):
             assert load_map(path).landmarks
         else:
             assert load_config(path) != config_of({})
