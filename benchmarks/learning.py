@@ -58,6 +58,7 @@ from fgloc_training.data import load_run
 from fgloc_training.train import train
 
 CHANGES = ("floor", "load", "wheel", "both")
+DRIVES = ("ackermann", "mecanum")
 WAYS: dict[str, dict[str, Any]] = {
     "none": {"use": False},  # first: what a process does only once is not counted as adaptation
     "adapted": {},
@@ -71,6 +72,7 @@ SENSORS: dict[str, tuple[type[Event], ...]] = {  # what a robot with these lacks
 }
 TEST_SEEDS: dict[Split, tuple[int, ...]] = {"test": tuple(range(171, 181)), "validation": tuple(range(161, 166))}
 _WORTH_SEEDS, _WORTH_CHANGES = 3, ("floor", "wheel")
+_DRIVE_WAYS = ("none", "adapted")
 _TRAIN_SEEDS = {"train": (11, 12, 13), "validation": (21, 22)}
 _DURATION_S, _FIXES_S, _DARK_S = 300.0, 120.0, 30.0
 _WORSE = 1.05
@@ -167,7 +169,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     recorded = drives.load_made(_made(cell.change, True)[0], cell.seed, f"learning/{cell.change}")
     recorded = replace(recorded, events=tuple(e for e in recorded.events if not isinstance(e, SENSORS[cell.sensors])))
     settings: dict[str, Any] = {
-        "motion": {"model": model(cell.change if cell.way == "native" else "base"), "use": True}
+        "motion": {"model": model(cell.change if cell.way == "native" or cell.change in DRIVES else "base"), "use": True}
     }
     settings["motion"] |= WAYS[cell.way]
     if cell.sensors == "commands":
@@ -215,7 +217,8 @@ def _at(times: FloatArray, poses: FloatArray, t: float) -> FloatArray:
 def _made(change: str, test: bool) -> tuple[Scenario, str]:
     """Scenario of the changed robot, as installed and driven otherwise for tests; and a hash of it."""
     made = scenario("calibrated", "test" if test else "train")
-    robot, floor = made.robot, made.world.floor
+    robot = load_suite(BUNDLED).find(change).robot if change in DRIVES else made.robot
+    floor = made.world.floor
     if change in ("load", "both"):
         robot = robot.model_copy(update={"payload": Payload(mass_kg=3.0, shift_at_s=1.0)})
     if change == "wheel":
@@ -260,7 +263,7 @@ def model(change: str) -> Path:
         for seed in seeds
     ]
     record_suite(jobs, folder, camera=False, workers=os.cpu_count() or 1)
-    network = NetworkConfig()
+    network = NetworkConfig(inputs=("commands", "sideways") if change == "mecanum" else ("commands",))
     runs = {j.folder: load_run(folder / j.folder / "bag", j.folder, network.dt_s, _DATA.history_s, _DATA) for j in jobs}
     parts = {part: tuple(j.folder for j in jobs if j.split == part) for part in _TRAIN_SEEDS}
     split = Parts(train=parts["train"], validation=parts["validation"])

@@ -15,6 +15,7 @@ from fgloc.sensors.checks import FieldChecks, Table, spikes
 from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
+    from fgloc.drives.base import Drive
     from fgloc.sensors.failures import Carriage
 
 
@@ -44,6 +45,12 @@ def from_ackermann(message: Any, when: When) -> Event:
 def from_ackermann_stamped(message: Any, when: When) -> Event:
     """Event of an ``ackermann_msgs/AckermannDriveStamped``."""
     return from_ackermann(message.drive, when)
+
+
+def told(event: ControlEvent, drive: Drive | None) -> ControlEvent:
+    """The command as a twist: that of a drive which is told a steering angle, else as it is."""
+    twist = None if drive is None or event.steering is None else drive.commanded(event.v, event.steering)
+    return event if twist is None else replace(event, v=twist[0], vy=twist[1], omega=twist[2], steering=None)
 
 
 def validator(checks: FieldChecks) -> Callable[[ControlEvent], Event | str]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import pty
 import re
@@ -423,6 +424,35 @@ def test_a_training_configuration_is_split_by_recording(tmp_path):
     assert config.limits.v_mps == pytest.approx(0.4)
     assert "0.5 min" in err
     assert f"next: fgloc train {file} --out models" in out
+
+
+@pytest.mark.parametrize("kind", ["mecanum", "ackermann"])
+def test_a_training_configuration_reads_what_the_drive_is_commanded(tmp_path, kind):
+    """Speeds to the side of a drive that goes there, yaw rates of one that is commanded by a steering angle."""
+    shape = {
+        "mecanum": "wheels: [a, b, c, d], radius: 0.05, half_sum: 0.27",
+        "ackermann": "wheelbase: 0.5",
+    }
+    bags = []
+    for i in range(3):
+        folder = tmp_path / f"run{i}"
+        folder.mkdir()
+        (folder / "robot.yaml").write_text(f"wheels:\n  drive: {{kind: {kind}, {shape[kind]}}}\n", encoding="utf-8")
+        with BagWriter(folder / "bag") as bag:
+            for k in range(60):
+                stamp = 1_700_000_000_000_000_000 + k * 100_000_000
+                if kind == "mecanum":
+                    bag.command("/cmd_vel", stamp, 0.2, 0.3, vy=0.1)
+                else:
+                    bag.ackermann("/ackermann_cmd", stamp, 0.2, math.atan(0.5 * 0.3 / 0.2))
+                bag.truth("/truth", stamp, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        bags.append(folder / "bag")
+    file = tmp_path / "train.yaml"
+    assert fgloc("train", "--init", *bags, "--out", file)[0] == 0
+    config = load_train_config(file)
+    assert config.network.inputs == (("commands", "sideways") if kind == "mecanum" else ("commands",))
+    assert config.limits is not None
+    assert config.limits.omega_radps == pytest.approx(0.3, rel=0.01)
 
 
 def test_without_truth_the_smoothed_runs_are_the_truth(tmp_path):

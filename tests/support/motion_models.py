@@ -17,7 +17,7 @@ def make_card(kind: str, **changes: Any) -> ModelCard:
     family = FAMILIES.get(kind)  # type: ignore[call-overload]
     displacement, bare = family == "displacement", kind in ("naive", "lag")
     inputs = changes.get("inputs", ("commands", "velocity") if family == "velocity" else ("commands",))
-    widths = {"velocity": 2, **{name: channel.width for name, channel in CHANNELS.items()}}
+    widths = {"velocity": 2, "sideways": 8, **{name: channel.width for name, channel in CHANNELS.items()}}
     n = 0 if bare else 16 + sum(widths.get(name, 0) for name in inputs) if displacement else 5
     scale = (0.05, 0.01, 0.2) if displacement else () if bare else (0.5, 1.0)
     fields: dict[str, Any] = dict(

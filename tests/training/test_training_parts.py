@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -232,6 +233,23 @@ def test_kinematics_are_recovered() -> None:
     assert fitted.scale_omega == pytest.approx(1.1, abs=0.01)
     assert fitted.yaw_per_m == pytest.approx(-0.05, abs=0.01)
     assert fitted.delay_s == pytest.approx(0.2, abs=0.02)
+
+
+def test_the_scale_of_commands_to_the_side_is_recovered() -> None:
+    rng = np.random.default_rng(5)
+    commands, stamps, _ = drive(rng, 60.0)
+    commands = [replace(c, vy=0.2 * math.sin(0.7 * k / 50.0)) for k, c in enumerate(commands)]
+    track = make_run("r", commands, stamps, np.zeros((len(stamps), 3)), 0.1, 2.0, DataConfig()).track
+    t = (stamps - track.origin_ns) * 1e-9
+    pose, poses = np.zeros(3), []
+    for v, omega, vy in track.means(np.append(t, t[-1] + 0.01) - 0.2, sideways=True):
+        poses.append(pose)
+        pose = se2.compose(pose, se2.exp((0.9 * v * 0.01, 0.7 * vy * 0.01, 1.1 * omega * 0.01)))
+    run = make_run("r", commands, stamps, np.array(poses), 0.1, 2.0, DataConfig())
+    fitted = fit_kinematics([run], sideways=True)
+    assert fitted.scale_vy == pytest.approx(0.7, abs=0.02)
+    assert fitted.scale_v == pytest.approx(0.9, abs=0.02)
+    assert fit_kinematics([run]).scale_vy == 0.0
 
 
 def test_lag_is_recovered(runs: dict[str, Run]) -> None:

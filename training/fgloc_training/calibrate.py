@@ -46,8 +46,12 @@ class MeanTwists(Protocol):
         ...
 
 
-def fit_kinematics(runs: list[Run], twists_of: Callable[[Run], MeanTwists] = lambda run: run.track) -> Kinematics:
+def fit_kinematics(
+    runs: list[Run], twists_of: Callable[[Run], MeanTwists] = lambda run: run.track, sideways: bool = False
+) -> Kinematics:
     """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
+
+    With ``sideways`` the scale of the commands to the left too.
 
     Shorter runs count whole. Over shorter times the robot's lag, which these kinematics do not know, would pass for a
     smaller scale.
@@ -76,7 +80,21 @@ def fit_kinematics(runs: list[Run], twists_of: Callable[[Run], MeanTwists] = lam
     bounds = ([0.3, 0.3, -1.0, 0.0], [2.0, 2.0, 1.0, 1.0])
     fit = least_squares(residuals, [1.0, 1.0, 0.0, 0.2], bounds=bounds, diff_step=1e-2, x_scale=[1.0, 1.0, 0.1, 0.2])
     scale_v, scale_omega, yaw_per_m, delay_s = (float(value) for value in fit.x)
-    return Kinematics(scale_v=scale_v, scale_omega=scale_omega, yaw_per_m=yaw_per_m, delay_s=delay_s)
+    scale_vy = _sideways_scale(runs, steps, delay_s) if sideways else 0.0
+    return Kinematics(scale_v=scale_v, scale_omega=scale_omega, scale_vy=scale_vy, yaw_per_m=yaw_per_m, delay_s=delay_s)
+
+
+def _sideways_scale(runs: list[Run], steps: int, delay_s: float) -> float:
+    """Scale of the commands to the left, by the true motion over as many steps; 1 if none was commanded."""
+    products = squares = 0.0
+    for run in runs:
+        k = run.starts(steps)
+        left = np.concatenate([[0.0], np.cumsum(0.5 * (run.velocities[1:, 1] + run.velocities[:-1, 1]) * run.dt_s)])
+        limits = np.column_stack([run.times[k], run.times[k + steps]]) - delay_s
+        told = run.track.means(limits, sideways=True)[:, 0, 2]
+        products += float(told @ (left[k + steps] - left[k])) / (steps * run.dt_s)
+        squares += float(told @ told)
+    return float(np.clip(products / squares, 0.3, 2.0)) if squares > 0.0 else 1.0
 
 
 def fit_lag(runs: list[Run], kinematics: Kinematics) -> Lag:

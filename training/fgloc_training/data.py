@@ -27,6 +27,7 @@ from fgloc.recording.reader import open_recording
 from fgloc.recording.truth import base_ground, base_pose
 from fgloc.sensor_setup import mounted_up
 from fgloc.sensors.base import Mounting, WheelJoints
+from fgloc.sensors.commands import told
 from fgloc.sensors.gyro import Gyro, ImuEvent
 from fgloc.sensors.learned.card import Signals, signals_of
 from fgloc.sensors.learned.network import CommandHistory
@@ -76,7 +77,8 @@ class SensorRecord:
         self._buffers: dict[type[MotionEvent], EventBuffer[Any]] = {kind: EventBuffer() for kind in kinds}
         for event in events:
             if isinstance(event, kinds):
-                self._buffers[type(event)].insert(event)
+                one = told(event, self.wheels.drive) if isinstance(event, ControlEvent) else event
+                self._buffers[type(event)].insert(one)
         self.commands: tuple[ControlEvent, ...] = self._all(ControlEvent)
         self._biases = self._gyro_biases(config.gyro, truth)
 
@@ -85,7 +87,8 @@ class SensorRecord:
         """Whether wheel odometry comes from wheels, not from commands."""
         if self.wheels.source in ("command", "none"):
             return False
-        by_joints = bool(self._stamps(JointsEvent)) and self.wheels.left_radius is not None
+        w = self.wheels
+        by_joints = bool(self._stamps(JointsEvent)) and (w.left_radius is not None or w.drive is not None)
         return by_joints or bool(self._stamps(OdometryEvent))
 
     @property

@@ -229,7 +229,11 @@ def sources(models: dict[str, Path], runs: list[Run]) -> dict[str, list[Rollout]
     That is: commands as given; scaled and delayed as the first model knows; wheel odometry if every run has it.
     """
     loaded = {name: load_model(path) for name, path in models.items()}
-    kinds = {"commands": Kinematics(), "calibrated commands": next(iter(loaded.values())).card.kinematics}
+    calibrated = next(iter(loaded.values())).card.kinematics
+    kinds = {
+        "commands": Kinematics(scale_vy=float(calibrated.scale_vy > 0.0)),
+        "calibrated commands": calibrated,
+    }
     found = {name: [roll_kinematics(kinematics, run, STEP_S) for run in runs] for name, kinematics in kinds.items()}
     if all(run.sensors.has_wheels for run in runs):
         found["wheel odometry"] = [roll_sources(run, STEP_S) for run in runs]

@@ -169,6 +169,7 @@ class DisplacementNet(nn.Module):
         self.config, self.kinematics, self.wheel_kinematics = config, kinematics, wheel_kinematics
         self.joints = runs[0].sensors.joints
         self.measured = tuple(name for name in CHANNELS if name in config.inputs)
+        self._sideways = "sideways" in config.inputs
         self._gyro_columns = self._columns("gyro")
         features = np.concatenate([self._features(run) for run in runs])
         base = np.concatenate([self._base(run) for run in runs])
@@ -201,6 +202,7 @@ class DisplacementNet(nn.Module):
         found, first = [], 0
         for ages, channels in [
             (len(self.config.edges_s) - 1, 2),
+            *([(len(self.config.edges_s) - 1, 1)] if self._sideways else []),
             *((len(self.config.signal_edges_s), CHANNELS[name].width) for name in self.measured),
         ]:
             found += [(i, i + channels) for i in range(first, first + (ages - 1) * channels)]
@@ -209,9 +211,9 @@ class DisplacementNet(nn.Module):
 
     def _features(self, run: Run) -> FloatArray:
         middles = run.times + 0.5 * run.dt_s
-        commanded = run.track.means(middles[:, None] - np.array(self.config.edges_s)).reshape(len(middles), -1)
+        told = run.track.means(middles[:, None] - np.array(self.config.edges_s), self._sideways)
         signals, edges = self._signals(run), np.array(self.config.signal_edges_s)
-        parts = [commanded]
+        parts = [told[..., :2].reshape(len(middles), -1), told[..., 2:].reshape(len(middles), -1)]
         for name in self.measured:
             signal = signals.named(name)
             if signal is None:
@@ -229,7 +231,7 @@ class DisplacementNet(nn.Module):
 
     def _columns(self, name: str) -> slice:
         """Columns of the features that hold a measured input; empty if it is not read."""
-        first, ages = 2 * (len(self.config.edges_s) - 1), len(self.config.signal_edges_s)
+        first, ages = (2 + self._sideways) * (len(self.config.edges_s) - 1), len(self.config.signal_edges_s)
         for other in self.measured:
             width = CHANNELS[other].width * ages
             if other == name:

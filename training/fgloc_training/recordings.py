@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from fgloc.config import Config
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.recording.reader import Recording
+from fgloc.sensors.commands import told
 from fgloc.types import ControlEvent, FloatArray
 from fgloc_training.config import SpeedLimits
 from fgloc_training.data import Run
@@ -32,6 +33,7 @@ class Found:
     duration_s: float
     has_truth: bool
     fastest: tuple[float, float, float]  # commanded: forward, turning, backward [m/s, rad/s, m/s]
+    sideways: float = 0.0  # commanded to either side, of a drive that goes there [m/s]
 
 
 def look(bag: Path, config: Config) -> Found:
@@ -46,12 +48,16 @@ def look(bag: Path, config: Config) -> Found:
                 f"{bag}: no commands, which are what a model of motion reads; record the topic that drives the robot "
                 "(geometry_msgs/Twist or TwistStamped), or name it: recording.topics.command in robot.yaml"
             )
-        forward = turning = backward = 0.0
+        forward = turning = backward = sideways = 0.0
+        drive = config.wheels.drive
         for event in recording.events():
             if isinstance(event, ControlEvent):
-                forward, backward = max(forward, event.v), max(backward, -event.v)
-                turning = max(turning, abs(event.omega))
-        return Found(bag, recording.duration_s, "truth" in recording.roles, (forward, turning, backward))
+                command = told(event, drive)
+                forward, backward = max(forward, command.v), max(backward, -command.v)
+                turning = max(turning, abs(command.omega))
+                sideways = max(sideways, abs(command.vy) if drive is not None and drive.slides else 0.0)
+        fastest = forward, turning, backward
+        return Found(bag, recording.duration_s, "truth" in recording.roles, fastest, sideways)
 
 
 def missing(found: Sequence[Found]) -> list[str]:
@@ -84,6 +90,7 @@ def training_yaml(found: Sequence[Found], file: Path, robot: str = "my robot") -
     rest = names[: len(names) - len(test)]
     train, validation = rest[:-held], rest[-held:]
     limits = [max(f.fastest[i] for f in found) for i in range(3)]
+    sideways = any(f.sideways > 0.0 for f in found)
     lines = [
         "# Training of a motion model; every key with its default is in docs/identification.md.",
         f"#   fgloc train {file.name} --out models",
@@ -107,6 +114,7 @@ def training_yaml(found: Sequence[Found], file: Path, robot: str = "my robot") -
         f"  test: [{', '.join(test)}]  # what the model is judged by; it learns nothing of them",
         "# The fastest commands of these recordings. Give the robot's own limits, and training says what was left out.",
         f"limits: {{v_mps: {limits[0] or 0.1:.3g}, omega_radps: {limits[1] or 0.1:.3g}, reverse_mps: {limits[2]:.3g}}}",
+        *(["network: {inputs: [commands, sideways]}  # this drive is commanded to the side too"] if sideways else []),
         "# On a floor where wheels slide, leave this out; elsewhere it cuts the jumps of a positioning system:",
         "# data: {max_sideways_mps: 0.02}",
     ]

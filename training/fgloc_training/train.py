@@ -59,7 +59,7 @@ def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
     """An untrained network on top of what is known of these recordings' robot."""
     if config.kind == "naive":
         return NaiveNet(config)
-    kinematics = fit_kinematics(training)
+    kinematics = fit_kinematics(training, sideways="sideways" in config.inputs)
     if config.kind in ("displacement", "gru"):
         wheel_kinematics = fit_kinematics(training, _wheels_of) if "wheels" in config.inputs else Kinematics()
         return DisplacementNet(config, kinematics, wheel_kinematics, training)

@@ -23,7 +23,7 @@ FORMAT = "fgloc-motion"
 VERSION = 1
 CHANNELS = {c.name: c for c in sorted((*_GYRO_CHANNELS, *_WHEEL_CHANNELS), key=lambda c: c.rank)}
 """What a model may read beside commands, by name, in the order in which a network reads it."""
-_OWN_INPUTS = ("commands", "velocity")  # others are channels that sensors bring
+_OWN_INPUTS = ("commands", "sideways", "velocity")  # others are channels that sensors bring
 
 
 def _known_input(name: str) -> str:
@@ -69,6 +69,7 @@ class Kinematics(Section):
 
     scale_v: Positive = 1.0
     scale_omega: Positive = 1.0
+    scale_vy: Annotated[FiniteFloat, Field(ge=0)] = Field(0.0, description="0: the robot is not commanded sideways")
     yaw_per_m: FiniteFloat = 0.0
     delay_s: Annotated[FiniteFloat, Field(ge=0, le=2.0)] = 0.0
 
@@ -122,9 +123,9 @@ class ModelCard(Section):
     ``naive``: the robot moves as commanded. A ``velocity`` model maps (v, ω, u_v, u_ω, Δt) to the velocity Δt later: a
     first-order lag plus Δt times a network. ``lag`` has no network, ``arx`` a linear one, ``rate`` no lag: its network
     is the acceleration. A ``displacement`` model maps the mean commands of the age bins ``edges_s`` and whatever else
-    ``inputs`` names (means of measured signals over the sub-step and over ages before it, the velocity's innovation) to
-    a residual twist on the best known kinematics and three log-variances; ``gru`` reads the bins one after the other
-    with a recurrent cell of ``hidden[0]`` units, oldest first.
+    ``inputs`` names (``sideways``: vy of the commands in the same bins; means of measured signals over the sub-step and
+    over ages before it; the velocity's innovation) to a residual twist on the best known kinematics and three
+    log-variances. ``gru`` reads the bins one after the other, oldest first, by a cell of ``hidden[0]`` units.
     """
 
     format: Literal["fgloc-motion"] = "fgloc-motion"
@@ -172,7 +173,12 @@ class ModelCard(Section):
         if self.family != "displacement":
             return 0 if self.kind in ("naive", "lag") else 5
         measured = len(self.signal_edges_s) * sum(CHANNELS[name].width for name in self.measured)
-        return 2 * (len(self.edges_s) - 1) + measured + 2 * ("velocity" in self.inputs)
+        return self.n_commands * (len(self.edges_s) - 1) + measured + 2 * ("velocity" in self.inputs)
+
+    @property
+    def n_commands(self) -> int:
+        """How many numbers of a command a displacement model reads: v and ω, perhaps vy."""
+        return 2 + ("sideways" in self.inputs)
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -214,8 +220,12 @@ class ModelCard(Section):
                 raise ValueError(
                     f"the input {channel.name} needs left_radius, right_radius and track of the card's joints"
                 )
-        if self.family != "displacement" and self.measured:
-            raise ValueError(f"a {self.kind} model reads commands and velocity, not {', '.join(self.measured)}")
+        if self.family != "displacement" and set(self.inputs) - {"commands", "velocity"}:
+            raise ValueError(f"a {self.kind} model reads commands and velocity, got {', '.join(self.inputs)}")
+        if ("sideways" in self.inputs) != (self.kinematics.scale_vy > 0.0):
+            need = "more than 0" if "sideways" in self.inputs else "0"
+            given = f"kinematics.scale_vy is {self.kinematics.scale_vy:g}"
+            raise ValueError(f"{given}, the inputs {', '.join(self.inputs)} need {need}")
         n_scales = self.n_outputs if self.family != "displacement" else 3
         for name, values, wanted in (
             ("input_mean", self.input_mean, self.n_inputs),

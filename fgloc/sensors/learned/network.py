@@ -165,11 +165,13 @@ class CommandHistory:
         self._events = list(commands)
         self._times = np.empty(capacity)
         self._integrals = np.zeros(capacity, dtype=np.complex128)  # of v + iω: both by one interpolation
+        self._sideways = np.zeros(capacity)  # of vy
         times = self._times[:n]
         times[:] = [c.stamp_ns - self.origin_ns for c in commands]
         times *= 1e-9
         steps = np.diff(times)
         np.cumsum(np.multiply([complex(c.v, c.omega) for c in commands[:-1]], steps), out=self._integrals[1:n])
+        np.cumsum(np.multiply([c.vy for c in commands[:-1]], steps), out=self._sideways[1:n])
         self._extend(())
 
     def following(self, commands: tuple[ControlEvent, ...]) -> CommandHistory:
@@ -185,39 +187,44 @@ class CommandHistory:
         self._extend(commands[i + 1 :])
         return self
 
-    def integrals(self, times_s: FloatArray) -> FloatArray:
-        """Integrals of v and ω ``(..., 2)`` up to times ``(...)`` since the origin."""
+    def integrals(self, times_s: FloatArray, sideways: bool = False) -> FloatArray:
+        """Integrals of v and ω ``(..., 2)``, or of v, ω and vy ``(..., 3)``, up to times ``(...)`` since the origin."""
         n = len(self._events) + 1
         integrals = np.interp(times_s, self._times[:n], self._integrals[:n])
-        return integrals.view(np.float64).reshape(*times_s.shape, 2)
+        told = integrals.view(np.float64).reshape(*times_s.shape, 2)
+        if not sideways:
+            return told
+        return np.concatenate([told, np.interp(times_s, self._times[:n], self._sideways[:n])[..., None]], axis=-1)
 
-    def means(self, limits_s: FloatArray) -> FloatArray:
-        """Mean (v, ω) between neighboring limits.
+    def means(self, limits_s: FloatArray, sideways: bool = False) -> FloatArray:
+        """Mean (v, ω), or (v, ω, vy), between neighboring limits.
 
         Args:
             limits_s: ``(..., m)`` times since the origin, strictly monotonic along the last axis.
+            sideways: whether vy is asked for.
 
         Returns:
-            ``(..., m - 1, 2)``.
+            ``(..., m - 1, 2)`` or ``(..., m - 1, 3)``.
         """
-        return np.asarray(np.diff(self.integrals(limits_s), axis=-2) / np.diff(limits_s)[..., None])
+        return np.asarray(np.diff(self.integrals(limits_s, sideways), axis=-2) / np.diff(limits_s)[..., None])
 
     def _extend(self, events: tuple[ControlEvent, ...]) -> None:
         """Append, then one more entry, overwritten by the next command: the last one holds.
 
         In plain floats: reading single elements of arrays would take most of the time.
         """
-        times, integrals = self._times, self._integrals
+        times, integrals, sideways = self._times, self._integrals, self._sideways
         k, last = len(self._events), self._events[-1]
-        t, integral = float(times[k - 1]), complex(integrals[k - 1])
+        t, integral, left = float(times[k - 1]), complex(integrals[k - 1]), float(sideways[k - 1])
         for event in events:
             now = (event.stamp_ns - self.origin_ns) * 1e-9
-            integral, t = integral + complex(last.v, last.omega) * (now - t), now
-            times[k], integrals[k] = t, integral
+            integral, left, t = integral + complex(last.v, last.omega) * (now - t), left + last.vy * (now - t), now
+            times[k], integrals[k], sideways[k] = t, integral, left
             k, last = k + 1, event
         self._events.extend(events)
         times[k] = t + _FOREVER_S
         integrals[k] = integral + complex(last.v, last.omega) * _FOREVER_S
+        sideways[k] = left + last.vy * _FOREVER_S
 
 
 # Of the norms of the gain and of the correlation: at 1 one of the two would add no information and its covariance would
@@ -362,13 +369,15 @@ class MotionModel(Protocol):
 
 def calibrated(kinematics: Kinematics, track: CommandHistory, limits: FloatArray) -> FloatArray:
     """Mean body twists ``(n, 3)`` between limits [s] of the calibrated kinematics."""
-    return np.asarray(track.means(limits - kinematics.delay_s) @ gains(kinematics))
+    means = track.means(limits - kinematics.delay_s, kinematics.scale_vy > 0.0)
+    return np.asarray(means @ gains(kinematics))
 
 
 def gains(kinematics: Kinematics) -> FloatArray:
-    """``(2, 3)``: commands (v, ω) times it are body twists."""
-    v = kinematics.scale_v
-    return np.array([[v, 0.0, kinematics.yaw_per_m * v], [0.0, 0.0, kinematics.scale_omega]])
+    """``(2, 3)``: commands (v, ω) times it are body twists; ``(3, 3)`` of a robot that is commanded sideways."""
+    v, left = kinematics.scale_v, kinematics.scale_vy
+    rows = [[v, 0.0, kinematics.yaw_per_m * v], [0.0, 0.0, kinematics.scale_omega], [0.0, left, 0.0]]
+    return np.array(rows if left > 0.0 else rows[:2])
 
 
 def noise_density(noise: NoiseDensity, v: float, omega: float) -> tuple[float, float, float]:
@@ -568,7 +577,9 @@ class DisplacementModel:
         self._n_inputs = card.n_inputs
         self._reads_velocity = "velocity" in card.inputs
         self._spread_gain = 2.0 * _DISAGREEMENT_S * np.array(card.variance_scale)
+        self._sideways = "sideways" in card.inputs
         self._n_bins = 2 * len(self._widths)
+        self._n_told = card.n_commands * len(self._widths)
         self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
         self._track: CommandHistory | None = None
 
@@ -621,14 +632,16 @@ class DisplacementModel:
         if plan is None:
             plan = self._plans[n] = self._plan(n)
         slope, offset, means_of = plan
-        means = means_of @ track.integrals(slope * dt + (offset + start))
+        means = means_of @ track.integrals(slope * dt + (offset + start), self._sideways)
         x = np.empty((n, self._n_inputs), dtype=np.float32)
-        x[:, : self._n_bins] = means[n:].reshape(n, -1)
+        x[:, : self._n_bins] = means[n:, :2].reshape(n, -1)
+        if self._sideways:
+            x[:, self._n_bins : self._n_told] = means[n:, 2].reshape(n, -1)
         return means[:n] @ self._gains, x
 
     def _measured(self, base: FloatArray, x: Float32Array, signals: Signals | None, start_ns: int, dt: float) -> None:
         """Fill the network's inputs from signals, and replace the twists that signals measure better than commands."""
-        n, at = len(base), self._n_bins
+        n, at = len(base), self._n_told
         start = 0.0 if signals is None else (start_ns - signals.origin_ns) * 1e-9
         starts = start + dt * np.arange(n, dtype=np.float64)
         for name in self.card.measured:

@@ -30,6 +30,7 @@ from fgloc.sensors.base import (
     Parameter,
     Rank,
 )
+from fgloc.sensors.commands import told
 from fgloc.sensors.learned.card import FORMAT, VERSION, ModelCard, SignalReader
 from fgloc.sensors.learned.network import (
     Answering,
@@ -41,10 +42,11 @@ from fgloc.sensors.learned.network import (
     RecurrentNetwork,
     VelocityModel,
 )
-from fgloc.types import FloatArray, MotionEvent, MotionMeasurement, Setting, Step
+from fgloc.types import ControlEvent, FloatArray, MotionEvent, MotionMeasurement, Setting, Step
 
 if TYPE_CHECKING:
     from fgloc.config import Config
+    from fgloc.drives.base import Drive
 
 
 _CELL = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
@@ -248,13 +250,20 @@ class LearnedMotion:
             signal that the model reads has a gap.
     """
 
-    def __init__(self, model: MotionModel, config: MotionConfig, imu_up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+    def __init__(
+        self,
+        model: MotionModel,
+        config: MotionConfig,
+        imu_up: ArrayLike = (0.0, 0.0, 1.0),
+        drive: Drive | None = None,
+    ) -> None:
         """Take a loaded model.
 
         Args:
             model: the model.
             config: whether it is used.
             imu_up: ``(3,)`` the base's z axis in the IMU's frame.
+            drive: whose steering angle may be commanded in place of a yaw rate.
         """
         self.model = model
         self.rejections: Counter[str] = Counter()
@@ -262,7 +271,9 @@ class LearnedMotion:
         self._reader = SignalReader(model.card, imu_up)
         self._gains = config.scale, config.turn_scale, config.yaw_per_m
         # A velocity model carries its velocity from step to step; measured signals are known for the step alone
-        self._at_any_time = model.card.family != "velocity" and model.card.inputs == ("commands",)
+        self._at_any_time = model.card.family != "velocity" and {*model.card.inputs} <= {"commands", "sideways"}
+        self._drive = drive
+        self._told: dict[ControlEvent, ControlEvent] = {}  # commands of the newest step as twists
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
 
@@ -309,7 +320,7 @@ class LearnedMotion:
             self._reject(f"learned.no_{signals}")
             return None
         velocity = self._velocity if self._reached == (step.segment, step.start_ns) else None
-        prediction = self.model.predict(step.controls, step.start_ns, step.stamp_ns, velocity, signals)
+        prediction = self.model.predict(self._commands(step), step.start_ns, step.stamp_ns, velocity, signals)
         if prediction is None:
             self._reject("learned.non_finite")
             return None
@@ -354,7 +365,7 @@ class LearnedMotion:
         """
         if not (self._use and self._at_any_time) or start_ns == end_ns or self._unusable(step):
             return None
-        found = self.model.predict(step.controls, min(start_ns, end_ns), max(start_ns, end_ns), None)
+        found = self.model.predict(self._commands(step), min(start_ns, end_ns), max(start_ns, end_ns), None)
         if found is None:
             return None
         motion = self._adapted(found.motion)
@@ -362,6 +373,13 @@ class LearnedMotion:
             return motion, found.cov
         ad = se2.adjoint(motion)
         return se2.inverse(motion), np.asarray(ad @ found.cov @ ad.T)
+
+    def _commands(self, step: Step) -> tuple[ControlEvent, ...]:
+        """Commands of a step as twists; of the same command the same object, by which a model goes on."""
+        if self._drive is None or all(command.steering is None for command in step.controls):
+            return step.controls
+        self._told = {command: self._told.get(command) or told(command, self._drive) for command in step.controls}
+        return tuple(self._told.values())
 
     def _unusable(self, step: Step) -> str:
         for command in reversed(step.controls):
@@ -387,7 +405,8 @@ def learned_motion(config: Config, up: Callable[[], FloatArray] | None) -> Learn
     """
     if not config.motion.use or config.motion.model is None:
         return None
-    return LearnedMotion(load_model(config.motion.model), config.motion, (0.0, 0.0, 1.0) if up is None else up())
+    level = (0.0, 0.0, 1.0) if up is None else up()
+    return LearnedMotion(load_model(config.motion.model), config.motion, level, config.wheels.drive)
 
 
 def with_model(config: Config, model: Path) -> Config:
