@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
 from fgloc.config import Config, base_role
+from fgloc.diagnosis.pairs import MAD
 from fgloc.diagnosis.truth import truth_sentence
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation.judgements import Judgement, judgements
@@ -226,9 +227,11 @@ def all_findings(
         rejections: rejected items by ``sensor.reason``.
         keyframes: number of poses.
         size: scale against the truth.
-        frame: that the truth is in another frame, which makes errors of what are none.
+        frame: that the truth is in another frame or has other axes, which makes errors of what are none.
     """
-    misjudged = [frame] if frame is not None else _optimistic(result, nees_over_3)
+    known = {finding.code for finding in result.findings}
+    judged = _optimistic(result, nees_over_3) if frame is None else [frame]
+    misjudged = [finding for finding in judged if finding.code not in known]
     return ordered([*result.findings, *_sized(size), *misjudged, *_dropped(result, rejections, keyframes)])
 
 
@@ -242,6 +245,27 @@ def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | N
     sentence = truth_sentence(config, np.column_stack([times, matched.truth]), times, matched.estimate)
     lines = {"truth.align": "se2"}
     return None if sentence is None else Finding("truth.frame", sentence, Severity.WARNING, lines)
+
+
+def _turned(config: Config, matched: Matched) -> Finding | None:
+    """Finding that the truth's yaw is another axis than the robot's: off by one angle, where positions agree."""
+    off = se2.wrap_array(matched.errors[:, 2])
+    mean = float(np.angle(np.exp(1j * off).mean()))
+    spread = float(np.median(np.abs(se2.wrap_array(off - mean)))) * MAD
+    size, extent = size_of(matched), float(np.hypot(*matched.truth[:, :2].std(axis=0)))
+    agree = size is not None and ate_rmse_m(matched) < _AGREE * extent
+    if not agree or abs(mean) < _TURNED_RAD or spread > _AGREE * abs(mean):
+        return None
+    offset = round(math.remainder(config.truth.yaw_offset_rad - mean, math.tau), 3)
+    text = (
+        f"The truth's yaw is {math.degrees(-mean):+.1f}° (± {math.degrees(spread):.1f}) off the estimate's, while "
+        f"positions agree: the tracked body is turned by that. If so, set truth.yaw_offset_rad: {offset:g}"
+    )
+    return Finding("truth.mounting", text, Severity.WARNING, {"truth.yaw_offset_rad": f"{offset:g}"}, -mean, spread)
+
+
+_TURNED_RAD = 0.1  # yaw of a truth that is worth a word
+_AGREE = 0.25  # largest error of positions over the path's extent, and spread of the yaw over what it is off by
 
 
 @dataclass(frozen=True, slots=True)
@@ -572,7 +596,7 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
                     dict(sorted(result.rejections.items())),
                     len(stamps),
                     against_truth(size_of),
-                    against_truth(lambda m: _elsewhere(result, config, m)),
+                    against_truth(lambda m: _elsewhere(result, config, m) or _turned(config, m)),
                 ),
             )
         ),

@@ -533,6 +533,17 @@ def test_a_truth_in_another_frame_is_named_and_blames_no_covariance(tmp_path):
         assert [f["lines"] for f in findings if f["code"] == "truth.frame"] == [{"truth.align": "se2"}] * len(codes)
 
 
+def test_a_truth_whose_body_is_turned_is_named_in_a_short_run_too_and_blames_no_covariance(tmp_path):
+    """What the recording tells of it before the run needs more windows than a few seconds have."""
+    bag = write_circle(tmp_path, seconds=6.0)
+    (tmp_path / "robot.yaml").write_text("truth: {yaw_offset_rad: -1.2}\n")
+    assert fgloc("smooth", bag, "--out", tmp_path / "turned")[0] == 0
+    findings = json.loads((tmp_path / "turned" / "metrics.json").read_text())["findings"]
+    assert [f["code"] for f in findings if f["severity"] != "note"] == ["truth.mounting"]
+    lines = {k: float(v) for f in findings if f["code"] == "truth.mounting" for k, v in f["lines"].items()}
+    assert lines == {"truth.yaw_offset_rad": pytest.approx(0.0, abs=0.05)}
+
+
 def test_info_names_a_map_of_other_markers(bag, tmp_path):
     (tmp_path / "map.yaml").write_text("landmarks:\n  - {id: 90, position: [1, 2]}\n  - {id: 91, position: [4, 2]}\n")
     code, out, _ = fgloc("info", bag, "--map", tmp_path / "map.yaml")
