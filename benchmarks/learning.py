@@ -14,6 +14,8 @@ installed, drive by control functions that no training has seen: corners without
 - ``never_worse``: share of all those runs (seeds, changes) in which the mean error of ``adapted`` is more than 5 % worse than
   that of ``frozen`` or of ``none``.
 - ``worth.SENSORS.CHANGE.WAY.ate_mm``: runs of three seeds with wheels (``wheels``), with wheels and gyro (``gyro``): mean error.
+- ``drive.DRIVE.WAY.{ate_mm,nees_over_3,drift30_percent}``: cars and mecanum robots, commands alone, with a model that was
+  trained on such robots (``adapted``) and without; three seeds.
 - ``wheels_only.dark60.MODE.{ate_mm,nees_over_3}``: robots of `benchmarks.installed` on slippery patches, a minute dark,
   whose gyro and model are taken away; ``.sound_named``: share of the runs in which a sound marker is accused.
 - ``foreign.dark20.*``: likewise on a grippy floor, with a model of another robot in place of their own, dark from 1 to 21 s.
@@ -98,12 +100,14 @@ class Cell:
 def measure(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
     """Yield every row; a quick run has one seed and one change."""
     seeds, changes = (TEST_SEEDS[split][:1], CHANGES[:1]) if quick else (TEST_SEEDS[split], CHANGES)
-    for change in ("base", *changes):
+    for change in ("base", *changes, *(() if quick else DRIVES)):
         model(change)
     cells = [Cell(c, s, "commands", way) for c in changes for s in seeds for way in WAYS]
     rest = [w for w in WAYS if w != "native"]
     worth = [c for c in _WORTH_CHANGES if c in changes]
     cells += [Cell(c, s, k, w) for c in worth for s in seeds[:_WORTH_SEEDS] for k in ("wheels", "gyro") for w in rest]
+    others = () if quick else DRIVES
+    cells += [Cell(c, s, "commands", w) for c in others for s in seeds[:_WORTH_SEEDS] for w in _DRIVE_WAYS]
     groups = [
         [cell for cell in cells if (cell.change, cell.seed) == key]
         for key in sorted({(c.change, c.seed) for c in cells})
@@ -113,6 +117,7 @@ def measure(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
         found.update(done)
     yield from _floor(found, changes, seeds)
     yield from _worth(found, worth, seeds[:_WORTH_SEEDS])
+    yield from _drives(found, others, seeds[:_WORTH_SEEDS])
     ratios = [
         found[Cell(c, s, "commands", "adapted")]["step_ms"] / found[Cell(c, s, "commands", "frozen")]["step_ms"]
         for c in changes
@@ -154,6 +159,16 @@ def _worth(found: dict[Cell, dict[str, Any]], changes: Sequence[str], seeds: Seq
                 yield _row(f"worth.{sensors}.{change}.{way}.ate_mm", ate, "mm")
 
 
+def _drives(found: dict[Cell, dict[str, Any]], drives: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
+    for drive in drives:
+        for way in _DRIVE_WAYS:
+            runs = [found[Cell(drive, s, "commands", way)] for s in seeds]
+            yield _row(f"drive.{drive}.{way}.ate_mm", [run["ate_mm"] for run in runs], "mm")
+            yield _row(f"drive.{drive}.{way}.nees_over_3", [run["nees_over_3"] for run in runs])
+            per_seed = [100.0 * run["ends"][0] / run["ends"][1] for run in runs]
+            yield _row(f"drive.{drive}.{way}.drift30_percent", per_seed, "%")
+
+
 # --- One run ----------------------------------------------------------------------------------------------------------
 
 
@@ -169,7 +184,10 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     recorded = drives.load_made(_made(cell.change, True)[0], cell.seed, f"learning/{cell.change}")
     recorded = replace(recorded, events=tuple(e for e in recorded.events if not isinstance(e, SENSORS[cell.sensors])))
     settings: dict[str, Any] = {
-        "motion": {"model": model(cell.change if cell.way == "native" or cell.change in DRIVES else "base"), "use": True}
+        "motion": {
+            "model": model(cell.change if cell.way == "native" or cell.change in DRIVES else "base"),
+            "use": True,
+        }
     }
     settings["motion"] |= WAYS[cell.way]
     if cell.sensors == "commands":

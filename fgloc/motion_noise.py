@@ -32,6 +32,7 @@ _IMAGES_S = 60.0  # likewise, if it has images: to find the markers in them take
 _LEAST_STEPS = 100
 _RANGE = math.log(4.0)  # of each factor, up and down
 _PRIOR = math.log(3.0)  # sigma of its logarithm
+_SIZE = 0.1  # sigma of the logarithm of the wheels' distances over those that sightings tell without a map
 _TELLS = 1.0  # by which the logarithm of the likelihood must grow
 _FAR = 2.0  # with such a factor other sightings are accepted: a second round
 _DISAGREES = 2.0  # scale on the covariance of wheels that differ from other sources more than they use to
@@ -64,6 +65,9 @@ def identify_motion_noise(
 
     A recording can show that the noise is larger. That it is smaller it shows only in part, as errors that last longer
     than a step seem smaller than they are: a factor below 1 is replaced by its root, and for commands by 1.
+
+    Without a map the wheels alone say how large everything is, and ranges or markers that are a few per cent too long
+    would pass for noise of the wheels: one more factor is free then, on the wheels' distances. It is not used further.
 
     Args:
         bag: the recording; its first five minutes are used, or one minute if it has images.
@@ -116,28 +120,27 @@ def _most_likely(
         return None
     rules = parts.localizer.motion.sources.rules
 
+    sigmas = np.array([_PRIOR, _PRIOR] if factors.known else [_PRIOR, _PRIOR, _SIZE])
+
     def cost(logs: FloatArray) -> float:
-        scale = np.exp(logs[[0, 0, 1]])
+        scale, size = np.exp(logs[[0, 0, 1]]), np.exp(logs[2:])
         motions = [
-            _with_noise(frame, scale, rules) if ok else frame.motions
+            _with_noise(frame, scale, size, rules) if ok else frame.motions
             for frame, ok in zip(solver.frames, sound, strict=True)
         ]
-        return 0.5 * float(np.sum(np.square(logs))) / _PRIOR**2 - solver.evidence(motions)
+        return 0.5 * float(np.sum(np.square(logs / sigmas))) - solver.evidence(motions)
 
+    simplex = np.vstack([np.zeros(len(sigmas)), np.diag([math.log(2.0), math.log(2.0), _SIZE][: len(sigmas)])])
     best = minimize(
         cost,
-        np.zeros(2),
+        simplex[0],
         method="Nelder-Mead",
-        bounds=[(-_RANGE, _RANGE)] * 2,
-        options={
-            "initial_simplex": [[0.0, 0.0], [math.log(2.0), 0.0], [0.0, math.log(2.0)]],
-            "xatol": _ACCURACY,
-            "fatol": _TELLS,
-        },
+        bounds=[(-_RANGE, _RANGE)] * len(sigmas),
+        options={"initial_simplex": simplex, "xatol": _ACCURACY, "fatol": _TELLS},
     )
     least = 0.0 if rules.wheels_are_commands else 0.5
-    logs = np.where(best.x < 0.0, least * best.x, best.x)
-    return np.exp(logs), cost(np.zeros(2)) - cost(logs)
+    logs = np.append(np.where(best.x[:2] < 0.0, least * best.x[:2], best.x[:2]), best.x[2:])
+    return np.exp(logs[:2]), cost(np.append([0.0, 0.0], best.x[2:])) - cost(logs)
 
 
 def _scaled(noise: NoiseDensity, factors: FloatArray) -> dict[str, float]:
@@ -163,8 +166,13 @@ def _is_sound(frame: Keyframe) -> bool:
     )
 
 
-def _with_noise(frame: Keyframe, scale: FloatArray, rules: FusionRules) -> tuple[MotionMeasurement, ...]:
+def _with_noise(
+    frame: Keyframe, scale: FloatArray, size: FloatArray, rules: FusionRules
+) -> tuple[MotionMeasurement, ...]:
     wheels = frame.readings.wheels
     assert wheels is not None
-    readings = replace(frame.readings, wheels=replace(wheels, cov=wheels.cov * np.outer(scale, scale)))
+    scaled = replace(wheels, cov=wheels.cov * np.outer(scale, scale))
+    if len(size):
+        scaled = replace(scaled, motion=wheels.motion * [size[0], size[0], 1.0])
+    readings = replace(frame.readings, wheels=scaled)
     return tuple(NoiseBudget().combine(readings, rules))
