@@ -21,8 +21,11 @@ _AROUND = np.linspace(0.0, math.tau, 9)[:-1]
 BEACONS = np.column_stack([4.0 * np.cos(_AROUND) + 0.3 * _AROUND, 3.5 * np.sin(_AROUND)])
 
 
-def record(folder, of_way: float, of_yaw: float, seed: int = 3):
-    """A bag of an odometry whose noise is so many times the default, sightings and truth; and the map beside it."""
+def record(folder, of_way: float, of_yaw: float, seed: int = 3, long: float = 1.0):
+    """A bag of an odometry whose noise is so many times the default, sightings and truth; and the map beside it.
+
+    Ranges are ``long`` times the true ones.
+    """
     rng, noise = np.random.default_rng(seed), Config().wheels.noise
     true, said = np.array([1.5, 0.0, 0.5 * math.pi]), np.zeros(3)
     with BagWriter(folder / "bag") as bag:
@@ -31,7 +34,7 @@ def record(folder, of_way: float, of_yaw: float, seed: int = 3):
             bag.odometry("/odom", stamp, tuple(said), (0.0, 0.0, 0.0), stamp)
             away = BEACONS - true[:2]
             bearings = np.arctan2(away[:, 1], away[:, 0]) - true[2] + rng.normal(0.0, 0.02, len(away))
-            ranges = np.hypot(*away.T) + rng.normal(0.0, 0.1, len(away))
+            ranges = long * np.hypot(*away.T) + rng.normal(0.0, 0.1, len(away))
             seen = enumerate(zip(ranges.tolist(), se2.wrap_array(bearings).tolist(), strict=True))
             near = [(i, r, b) for i, (r, b) in seen if abs(b) < 1.0]
             if k % 5 == 0:
@@ -65,6 +68,14 @@ def factors(bag, with_map: bool):
 def test_the_noise_is_found(tmp_path, made, with_map):
     found = factors(record(tmp_path, *made), with_map)
     assert found == pytest.approx(made, rel=0.4)
+
+
+@pytest.mark.parametrize("long", [0.92, 1.08])
+def test_ranges_that_are_all_too_long_are_no_noise_of_the_wheels_without_a_map(tmp_path, long):
+    """The wheels alone say how large everything is then."""
+    of_way, of_yaw = factors(record(tmp_path, 1.0, 1.0, long=long), with_map=False)
+    assert of_way < 1.3
+    assert of_yaw < 1.3
 
 
 def test_noise_that_is_smaller_is_written_in_part(tmp_path):
