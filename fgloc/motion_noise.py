@@ -33,6 +33,7 @@ _LEAST_STEPS = 100
 _RANGE = math.log(4.0)  # of each factor, up and down
 _PRIOR = math.log(3.0)  # sigma of its logarithm
 _SIZE = 0.1  # sigma of the logarithm of the wheels' distances over those that sightings tell without a map
+_MOST = 6.0  # no wheels are so bad: the sightings are wrong
 _TELLS = 1.0  # by which the logarithm of the likelihood must grow
 _FAR = 2.0  # with such a factor other sightings are accepted: a second round
 _DISAGREES = 2.0  # scale on the covariance of wheels that differ from other sources more than they use to
@@ -91,7 +92,7 @@ def identify_motion_noise(
         total, gained = total * factors, gained + gain
         if factors.max() < _FAR:
             break
-    if not gained >= _TELLS:  # also if it is not a number
+    if not gained >= _TELLS or total.max() > _MOST:  # also if it is not a number
         return None
     value = f"{{{', '.join(f'{key}: {density:.3g}' for key, density in _scaled(noise, total).items())}}}"
     text = (

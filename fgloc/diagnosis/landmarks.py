@@ -43,6 +43,7 @@ _BIASED = 3.0  # times the configured bias that ranges usually are: shorter ones
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
+_BY_FAR, _NEARLY = 5.0, 2.0  # times a misfit: of what is refuted by few landmarks, of what is as good with them
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
 _FIRST_S = 8.0  # of sightings that tell where a run began: wheels err by centimetres over it
 _NO_MAP = 0.5  # residual over the spread of the landmarks: they stand elsewhere
@@ -97,8 +98,11 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
         return None
     best = _best(fits)
     reach = float(np.median(np.abs(planar(as_given.points, best.axes))))
-    if best.misfit > _FITS * reach or best.scale.sigma > 0.3 * best.scale.value:
-        return None  # nothing fits: the landmarks move, the wheels slip throughout, or the robot hardly moved
+    if best.misfit > _FITS * reach:
+        return None  # nothing fits: the landmarks move, or the wheels slip throughout
+    if best.scale.sigma > 0.3 * best.scale.value:  # too few landmarks, or the robot hardly moved
+        _optical_by_few(found, seen, fits, best)
+        return None
     if _along_axis(found, path, seen, best):
         as_given, ranged = as_configured(found, seen)
         fits = fit_sightings(path, as_given, turn_sigma=turn_sigma) or fits
@@ -145,6 +149,25 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
         _scale(found, path, raw, chosen)
     found.noise = track_noise(path, raw, chosen)
     return chosen
+
+
+def _optical_by_few(found: Conventions, seen: Sightings, fits: Mapping[str, Mounting], best: Mounting) -> None:
+    """Name an optical frame where few landmarks are seen, which determine no constant: the other one fits by far worse.
+
+    What a robot tells that drives straight on is alike about the camera's axis: then it is the usual frame.
+    """
+    body, optical = fits.get("body"), fits.get("optical")
+    level = np.allclose(_place(found)[:3, :3], np.eye(3), atol=1e-3)  # what is turned already is in axes of its own
+    if body is None or optical is None or not (seen.spatial and level):
+        return
+    if optical.misfit < _NEARLY * best.misfit and _BY_FAR * optical.misfit < body.misfit:
+        off_mm, other_mm = (1e3 * m.misfit for m in (optical, body))
+        text = (
+            "Positions of landmarks are in an optical frame (z ahead, x to the right): so they stay in place "
+            f"to {off_mm:.0f} mm while the wheels move, in the configured axes to {other_mm:.0f} mm; of so few nothing "
+            "else is told"
+        )
+        found.add("sightings.axes", text, {"recording.sightings_axes": "optical"})
 
 
 def _mirrored(

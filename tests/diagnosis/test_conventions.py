@@ -366,3 +366,23 @@ def test_a_truth_that_freezes_and_topics_that_nothing_reads_are_named(tmp_path):
     assert [f.severity for f in unused] == [Severity.NOTE]
     assert "uwb.anchors" in unused[0].text
     assert "place.unbounded" in [f.code for f in found]  # a sensor that is not built bounds nothing
+
+
+@pytest.mark.parametrize("optical", [True, False])
+def test_an_optical_frame_is_named_also_where_two_markers_are_seen_for_a_few_seconds(tmp_path, optical):
+    """So few determine no constant of their sensor; but in the axes of a body they would wander by a metre."""
+    rng, beacons = np.random.default_rng(2), np.array([[4.5, 1.0, 0.4], [4.0, -0.8, 0.5]])
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(180):
+            t = 0.05 * k
+            x, stamp = 0.25 * t, round((START_S + t) * 1e9)
+            bag.odometry("/odom", stamp, (x, 0.0, 0.0), (0.25, 0.0, 0.0), stamp)
+            if k % 2 == 0:
+                points = beacons - [x, 0.0, 0.3] + rng.normal(0.0, 0.01, beacons.shape)
+                if optical:
+                    points = np.column_stack([-points[:, 1], -points[:, 2], points[:, 0]])
+                seen = [(i, point, (0.0, 0.0, 0.0, 1.0), None) for i, point in enumerate(points.tolist())]
+                bag.marker_poses("/markers", stamp, seen, stamp, "base_link")
+    lines = {k: v for f in first_settings(tmp_path / "bag").found for k, v in f.lines.items()}
+    assert lines.get("recording.sightings_axes") == ("optical" if optical else None)
+    assert "recording.sightings_pose" not in lines
