@@ -19,6 +19,13 @@ has a frame of its own always.
 - ``field.geomean_over_odometry``: of runs with truth and landmarks. ``field.nees``: share of runs with NEES/3 in 0.4 to
   2.5, or exit 3 with the right cause. ``field.traps_found``, ``field.false``: see `benchmarks.field_sheet`.
 - ``field.beyond_gate``: constants that were used more than 4 prior sigmas from what was given.
+
+``--windows N``: N windows of each recording that has a truth and landmarks, of a fifth to seven tenths of it, drawn by
+``--seed``, in place of the recordings.
+
+- ``field.window.lost``: runs that end with 0 although their ATE is over twice that of odometry and of the textbook
+  begun alike, and 5 cm more, and NEES/3 over 6: whose covariance is wrong, too.
+- ``field.window.geomean_over_odometry``, ``field.window.nees``: as above, of all windows.
 """
 
 # ruff: noqa: E501 (lines of the page)
@@ -27,6 +34,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import random
 import re
 import subprocess
 import sys
@@ -43,7 +51,7 @@ import numpy as np
 
 from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field_peers import Heard, hear, textbook
-from benchmarks.field_recordings import RECORDINGS, Recording
+from benchmarks.field_recordings import RECORDINGS, Recording, window
 from benchmarks.field_sheet import MODES, SHEET, SOUND, Mode, Outcome, false_findings, found, right_cause
 from benchmarks.replays import kept
 from fgloc import se2
@@ -244,6 +252,44 @@ def measure(quick: bool, only: Sequence[str] = (), page: Path | None = None) -> 
         write_page(page, chosen, outcomes)
 
 
+def windows(count: int, seed: int, only: Sequence[str] = ()) -> Iterator[Row]:
+    """Rows of windows of the recordings."""
+    if not DATA.is_dir():
+        yield from not_run(["field.window.lost"], f"no {DATA}; set FGLOC_REAL_DATA")
+        return
+    rng, chosen = random.Random(seed), []
+    for recording in (r for r in RECORDINGS if r.truth and r.landmarks):
+        for _ in range(count):
+            share = rng.uniform(0.2, 0.7)
+            first = rng.uniform(0.0, 1.0 - share)
+            if not only or recording.name in only:
+                chosen.append(window(recording, first, first + share))
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        outcomes = dict(zip(chosen, pool.map(outcome, chosen), strict=True))
+    for r, o in outcomes.items():
+        _say(r, o)
+    runs = [(r, o, mode) for r, o in outcomes.items() for mode in MODES]
+    for r, o, mode in runs:
+        if mode in o.ate:
+            yield Row(f"field.window.{r.name}.{mode}.ate_m", o.ate[mode], unit="m")
+    lost = [f"{r.name}.{mode}" for r, o, mode in runs if _lost(o, mode)]
+    yield Row("field.window.lost", float(len(lost)), n=len(runs), unit=" ".join(lost))
+    logs = np.log([o.ate[mode] / o.ate["odometry"] for _, o, mode in runs if {mode, "odometry"} <= o.ate.keys()])
+    if len(logs):
+        yield Row("field.window.geomean_over_odometry", float(np.exp(logs.mean())), float(logs.std()), len(logs))
+    judged = [nees for _, o, mode in runs if o.codes.get(mode) == 0 and (nees := nees_of(o, mode)) is not None]
+    if judged:
+        good = [_NEES[0] <= nees <= _NEES[1] for nees in judged]
+        yield Row("field.window.nees", float(np.mean(good)), n=len(judged))
+
+
+def _lost(o: Outcome, mode: Mode) -> bool:
+    """Whether a run is far off, by its own covariance too, and does not say so."""
+    best = min((o.ate[name] for name in ("odometry", f"alike.{mode}") if name in o.ate), default=math.inf)
+    far = o.ate.get(mode, 0.0) > 2.0 * best + 0.05
+    return far and o.codes.get(mode) == 0 and (nees_of(o, mode) or 0.0) > 6.0
+
+
 def _of_recording(recording: Recording, o: Outcome) -> Iterator[Row]:
     for name in ("odometry", "textbook.batch", "textbook.online"):
         if name in o.ate:
@@ -431,5 +477,13 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--only", default="", help="comma-separated names; default: all")
     parser.add_argument("--page", type=Path, metavar="FILE.md", help="also write the table as a page")
+    parser.add_argument("--windows", type=int, default=0, metavar="N", help="of each recording; default: the whole")
+    parser.add_argument("--seed", type=int, default=0, help="of the windows")
     known, rest = parser.parse_known_args()
-    main(lambda quick: measure(quick, tuple(filter(None, known.only.split(","))), known.page), __doc__ or "", rest)
+    named = tuple(filter(None, known.only.split(",")))
+
+    def rows(quick: bool) -> Iterator[Row]:
+        """Rows of windows, or of the recordings."""
+        return windows(known.windows, known.seed, named) if known.windows else measure(quick, named, known.page)
+
+    main(rows, __doc__ or "", rest)

@@ -10,14 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate, pairwise
 from pathlib import Path
+from shutil import copy
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
+from rosbags.convert.converter import convert
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.io import loadmat
 
 from benchmarks.common import DATA
@@ -73,6 +77,34 @@ class Recording:
         """The set's own map, if it has one."""
         path = DATA / self.map if self.map else out / "map.yaml"
         return path if path.is_file() else None
+
+
+def window(recording: Recording, first: float, last: float) -> Recording:
+    """The part of a recording between two shares of its time, as a recording of its own."""
+    name = f"{recording.name}_{100.0 * first:.0f}_{100.0 * last:.0f}"
+    return replace(recording, name=name, make=partial(_window, recording, first, last), development=True)
+
+
+def _window(recording: Recording, first: float, last: float, _: Path, out: Path) -> None:
+    with TemporaryDirectory() as scratch:
+        whole = recording.bag(Path(scratch))
+        if whole.suffix == ".bag":
+            convert([whole], Path(scratch) / "ros2", "mcap", 9, None, "file", None, None, (), (), (), ())
+            whole = Path(scratch) / "ros2"
+        found_map = recording.map_path(Path(scratch))
+        with AnyReader([whole]) as reader, Writer(out / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            topics = {
+                c.id: writer.add_connection(c.topic, c.msgtype, typestore=reader.typestore) for c in reader.connections
+            }
+            begin, end = (
+                reader.start_time + round(share * (reader.end_time - reader.start_time)) for share in (first, last)
+            )
+            for connection, stamp_ns, raw in reader.messages():
+                latched = any(name in connection.topic for name in ("static", "camera_info"))
+                if begin <= stamp_ns <= end or (latched and stamp_ns < begin):
+                    writer.write(topics[connection.id], max(stamp_ns, begin), raw)
+        if found_map is not None and not recording.map:
+            copy(found_map, out / "map.yaml")
 
 
 # --- converters -------------------------------------------------------------------------------------------------------
