@@ -198,7 +198,7 @@ def test_cards_say_what_a_model_reads() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             make_card("displacement", **changes)
-    with pytest.raises(ValueError, match="got .*gyro"):
+    with pytest.raises(ValueError, match=r"got .*gyro"):
         make_card("velocity", inputs=("commands", "velocity", "gyro"))
 
 
