@@ -52,7 +52,8 @@ def _one_thread() -> None:
 @pytest.mark.parametrize(
     ("kind", "inputs"),
     [(kind, ("commands",)) for kind in get_args(Kind) if kind != "naive"]
-    + [(kind, ("commands", "velocity")) for kind in ("displacement", "gru")],
+    + [(kind, ("commands", "velocity")) for kind in ("displacement", "gru")]
+    + [(kind, ("commands", "sideways")) for kind in ("displacement", "gru")],
 )
 def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[str, Run], tmp_path: Path) -> None:
     torch.manual_seed(1)
@@ -81,6 +82,19 @@ def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[
             assert got is not None
             variances = np.exp(net.log_density(x).detach().numpy()[0, 0]) * 0.1
             np.testing.assert_allclose(np.diag(got.cov), variances, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["naive", "lag", "arx", "rate", "velocity"])
+def test_a_model_that_reads_no_commands_to_the_side_is_made_though_they_are_named(
+    kind: Kind, runs: dict[str, Run]
+) -> None:
+    """As it passes over other inputs: `train --init` names them whatever kind is chosen later."""
+    network = NetworkConfig(kind=kind, hidden=(8, 8), inputs=("commands", "sideways"))
+    config = TrainConfig(robot="r", recordings={n: Path(n) for n in runs}, leave_one_out=True, network=network)
+    net = new_net(network, [runs["run0"]])
+    card = card_of(net, config, training.leave_one_out(list(runs))[0], "a test")
+    assert "sideways" not in card.inputs
+    assert card.kinematics.scale_vy == 0.0
 
 
 def test_the_variance_starts_from_the_sizes_of_changes(tmp_path: Path) -> None:

@@ -59,8 +59,9 @@ def new_net(config: NetworkConfig, training: list[Run]) -> MotionNet:
     """An untrained network on top of what is known of these recordings' robot."""
     if config.kind == "naive":
         return NaiveNet(config)
-    kinematics = fit_kinematics(training, sideways="sideways" in config.inputs)
-    if config.kind in ("displacement", "gru"):
+    displaced = config.kind in ("displacement", "gru")
+    kinematics = fit_kinematics(training, sideways=displaced and "sideways" in config.inputs)
+    if displaced:
         wheel_kinematics = fit_kinematics(training, _wheels_of) if "wheels" in config.inputs else Kinematics()
         return DisplacementNet(config, kinematics, wheel_kinematics, training)
     lag = None if config.kind == "rate" else fit_lag(training, kinematics)
