@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,19 @@ def test_a_robot_that_is_commanded_to_the_side_is_predicted_at_any_time(tmp_path
     found = LearnedMotion(model, MotionConfig(use=True)).motion_between(step, T0 + SECOND, T0 + round(1.1 * SECOND))
     assert found is not None
     np.testing.assert_allclose(found[0], [0.0, 0.8 * 0.5 * 0.1, 0.0], atol=1e-9)
+
+
+def test_a_command_to_the_side_that_is_no_number_is_passed_over(tmp_path: Path) -> None:
+    """As wheels pass it over; the next ones are read again."""
+    model = sideways_model(tmp_path / "m.safetensors", np.random.default_rng(1), "displacement", 0.0)
+    learned = LearnedMotion(model, MotionConfig(use=True))
+    events = [command(0.0, 0.3, 0.0, -0.2), command(0.5, 0.3, 0.0, math.nan), command(1.0, 0.3, 0.0, -0.2)]
+    for k in range(2):
+        moved = learned.measure(step_of(events, 1.5 + 0.1 * k, 1.6 + 0.1 * k, k))
+        assert moved is not None
+        np.testing.assert_allclose(moved.motion, [0.9 * 0.03, -0.8 * 0.02, 0.0], atol=1e-9)
+    assert learned.measure(step_of([command(0.0, 0.3, 0.0, math.nan)], 1.0, 1.1)) is None
+    assert learned.rejections == {"learned.no_commands": 1}
 
 
 def test_a_steering_angle_is_the_yaw_rate_that_the_drive_makes_of_it(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -272,7 +273,7 @@ class LearnedMotion:
         self._gains = config.scale, config.turn_scale, config.yaw_per_m
         # A velocity model carries its velocity from step to step; measured signals are known for the step alone
         self._at_any_time = model.card.family != "velocity" and {*model.card.inputs} <= {"commands", "sideways"}
-        self._drive = drive
+        self._drive, self._sideways = drive, "sideways" in model.card.inputs
         self._told: dict[ControlEvent, ControlEvent] = {}  # commands of the newest step as twists
         self._velocity: FloatArray | None = None
         self._reached: tuple[int, int] | None = None  # segment and stamp at which that velocity holds
@@ -312,7 +313,8 @@ class LearnedMotion:
         """
         if not self._use:
             return None
-        if reason := self._unusable(step):
+        commands = self._commands(step)
+        if reason := self._unusable(commands, step.stamp_ns):
             self._reject(reason)
             return None
         signals = self._reader.read(step, gyro_bias)
@@ -320,7 +322,7 @@ class LearnedMotion:
             self._reject(f"learned.no_{signals}")
             return None
         velocity = self._velocity if self._reached == (step.segment, step.start_ns) else None
-        prediction = self.model.predict(self._commands(step), step.start_ns, step.stamp_ns, velocity, signals)
+        prediction = self.model.predict(commands, step.start_ns, step.stamp_ns, velocity, signals)
         if prediction is None:
             self._reject("learned.non_finite")
             return None
@@ -363,9 +365,12 @@ class LearnedMotion:
             None if the model reads more than commands, carries its velocity from step to step, is not used or cannot
             predict.
         """
-        if not (self._use and self._at_any_time) or start_ns == end_ns or self._unusable(step):
+        if not (self._use and self._at_any_time) or start_ns == end_ns:
             return None
-        found = self.model.predict(self._commands(step), min(start_ns, end_ns), max(start_ns, end_ns), None)
+        commands = self._commands(step)
+        if self._unusable(commands, step.stamp_ns):
+            return None
+        found = self.model.predict(commands, min(start_ns, end_ns), max(start_ns, end_ns), None)
         if found is None:
             return None
         motion = self._adapted(found.motion)
@@ -375,16 +380,22 @@ class LearnedMotion:
         return se2.inverse(motion), np.asarray(ad @ found.cov @ ad.T)
 
     def _commands(self, step: Step) -> tuple[ControlEvent, ...]:
-        """Commands of a step as twists; of the same command the same object, by which a model goes on."""
-        if self._drive is None or all(command.steering is None for command in step.controls):
-            return step.controls
-        self._told = {command: self._told.get(command) or told(command, self._drive) for command in step.controls}
+        """Commands of a step as twists; of the same command the same object, by which a model goes on.
+
+        One whose speed to the side is no number is passed over, if the model reads it.
+        """
+        commands = step.controls
+        if self._sideways and not all(math.isfinite(command.vy) for command in commands):
+            commands = tuple(command for command in commands if math.isfinite(command.vy))
+        if self._drive is None or all(command.steering is None for command in commands):
+            return commands
+        self._told = {command: self._told.get(command) or told(command, self._drive) for command in commands}
         return tuple(self._told.values())
 
-    def _unusable(self, step: Step) -> str:
-        for command in reversed(step.controls):
-            if command.stamp_ns <= step.stamp_ns:
-                stale = (step.stamp_ns - command.stamp_ns) * 1e-9 > self.model.card.hold_s
+    def _unusable(self, commands: Sequence[ControlEvent], stamp_ns: int) -> str:
+        for command in reversed(commands):
+            if command.stamp_ns <= stamp_ns:
+                stale = (stamp_ns - command.stamp_ns) * 1e-9 > self.model.card.hold_s
                 return "learned.stale_commands" if stale else ""
         return "learned.no_commands"
 
