@@ -284,7 +284,7 @@ def with_settings(config: Config, settings: Sequence[Setting]) -> Config:
 
 
 def map_found(landmark_map: LandmarkMap, installation: Installation, belief: InstallationEstimate) -> LandmarkMap:
-    """The map with its landmarks where they were found, each with its covariance."""
+    """The map with its landmarks where they were found, each with its covariance, boards with that of their pose."""
     moved = dict(landmark_map.landmarks)
     for i, (first, count) in installation.landmarks.items():
         landmark, rows = moved[i], slice(first, first + count)
@@ -292,7 +292,11 @@ def map_found(landmark_map: LandmarkMap, installation: Installation, belief: Ins
         place = landmark.position.copy()
         place[: min(count, 3)] += mean[:3]
         turned = landmark.rotation @ rotation_of(mean[3:]) if count == len(MARKER) else landmark.rotation
-        moved[i] = replace(landmark, position=place, rotation=turned, cov=_readable(cov), board=None)
+        moved[i] = replace(landmark, position=place, rotation=turned, cov=_readable(cov))
+    for ids, cov in installation.boards_found(belief):
+        on = {i: board for i in ids if (board := moved[i].board) is not None}
+        found = replace(on[ids[0]][0], cov=cov)
+        moved |= {i: replace(moved[i], board=(found, lever)) for i, (_, lever) in on.items()}
     return replace(landmark_map, landmarks=moved, notes=())
 
 

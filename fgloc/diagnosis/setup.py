@@ -159,7 +159,7 @@ def mirrored(landmark_map: LandmarkMap) -> LandmarkMap:
     flip = np.diag([1.0, -1.0, 1.0])
     across = np.diag([-1.0, 1.0, 1.0])
     known = {
-        i: replace(m, position=flip @ m.position, rotation=flip @ m.rotation @ across, cov=None)
+        i: replace(m, position=flip @ m.position, rotation=flip @ m.rotation @ across, cov=None, board=None)
         for i, m in landmark_map.landmarks.items()
     }
     return replace(landmark_map, landmarks=known)

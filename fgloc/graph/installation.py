@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +19,7 @@ from fgloc.config import Config
 from fgloc.sensors import registry
 from fgloc.sensors.base import Parameter
 from fgloc.stats import PRIOR_GATE, SURE_SIGMAS
-from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
+from fgloc.types import Board, FloatArray, IntArray, Landmark, LandmarkMap
 
 CAMERA = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "focal", "cx_px", "cy_px", "k1", "k2", "time_offset_s")
 SENSOR = ("range_scale", "bearing_offset_rad", "time_offset_s")
@@ -65,6 +65,26 @@ class InstallationEstimate:
     cov: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardPrior:
+    """Prior of the markers of a rigid board, which are displaced together."""
+
+    ids: tuple[int, ...]  # of its k markers
+    derivative: FloatArray  # (6 k, 6) of their poses by the board's
+    cov: FloatArray  # (6, 6) of the board's pose
+    own: FloatArray  # (6,) variances of each marker's pose on the board
+
+    def joint(self, rows: IntArray) -> FloatArray:
+        """Covariance ``(m, m)`` of some rows ``(m,)`` of the markers' poses."""
+        A = self.derivative[rows]
+        return np.asarray(A @ self.cov @ A.T + np.diag(self.own[rows % len(MARKER)]))
+
+    def alone(self) -> Iterator[tuple[int, FloatArray]]:
+        """Each marker, and the covariance ``(6, 6)`` of its pose."""
+        for j, i in enumerate(self.ids):
+            yield i, self.joint(np.arange(len(MARKER) * j, len(MARKER) * (j + 1)))
+
+
 class Installation:
     """Names, priors and places of all parameters in the state.
 
@@ -96,7 +116,7 @@ class Installation:
         effects: Mapping[str, Sequence[str]] | None = None,
         length: Sequence[str] = (),
         gates: Mapping[str, float] | None = None,
-        boards: Sequence[tuple[Sequence[int], FloatArray]] = (),
+        boards: Sequence[BoardPrior] = (),
     ) -> None:
         """Set prior sigmas by name; those of one block in the order of `CAMERA`, `SENSOR`, `MARKER` or `POINT`.
 
@@ -108,7 +128,7 @@ class Installation:
             effects: as the attribute; default: none is known.
             length: likewise.
             gates: likewise.
-            boards: markers ``(k,)`` of each board, and the covariance ``(6 k, 6 k)`` of their places together.
+            boards: those whose markers are displaced together.
         """
         blocks = {_block(name) for name, s in parameters.items() if s > 0.0} - {""}
         blocks |= {f"map.{i}" for i in landmark_cov or {}}
@@ -143,11 +163,9 @@ class Installation:
                 n = min(count, len(cov))
                 self._prior_cov[first : first + n, first : first + n] = cov[:n, :n]
         self._boards = boards
-        for ids, cov in boards:
-            held = [(i, j) for j, i in enumerate(ids) if self.landmarks.get(i, (0, 0))[1] == len(MARKER)]
-            rows = [self.landmarks[i][0] + r for i, _ in held for r in range(len(MARKER))]
-            of = [len(MARKER) * j + r for _, j in held for r in range(len(MARKER))]
-            self._prior_cov[np.ix_(rows, rows)] = cov[np.ix_(of, of)]
+        for board in boards:
+            rows, of = self._rows_on(board)
+            self._prior_cov[np.ix_(rows, rows)] = board.joint(of)
         self.sigmas = np.sqrt(np.diag(self._prior_cov))
         self._prior_mean = np.zeros(len(kept))
 
@@ -181,6 +199,22 @@ class Installation:
         self.sigmas = np.insert(self.sigmas, [at] * count, VACANT_SIGMA)
         self.constants += count
         return rows
+
+    def _rows_on(self, board: BoardPrior) -> tuple[IntArray, IntArray]:
+        """Rows ``(m,)`` of the markers of a board that are states, and which of all of its markers they are."""
+        places = [(*self.landmarks[i], len(MARKER) * j) for j, i in enumerate(board.ids) if i in self.landmarks]
+        pairs = [(first + r, at + r) for first, count, at in places for r in range(count)]
+        rows, of = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        return rows, of
+
+    def boards_found(self, belief: InstallationEstimate) -> Iterator[tuple[tuple[int, ...], FloatArray]]:
+        """Markers of each board whose markers are all states, and the covariance ``(6, 6)`` of the board's pose now."""
+        for board in self._boards:
+            if all(i in self.landmarks for i in board.ids):
+                rows, of = self._rows_on(board)
+                gain = np.linalg.solve(board.joint(of), board.derivative[of] @ board.cov).T
+                cov = board.cov + gain @ (belief.cov[np.ix_(rows, rows)] - board.joint(of)) @ gain.T
+                yield board.ids, 0.5 * (cov + cov.T)
 
     @property
     def vacancies(self) -> int:
@@ -439,12 +473,12 @@ def installation_of(
     places = {i: _landmark_sigmas(landmark, config, corners) for i, landmark in by_id.items()}
     given = {i: landmark.cov for i, landmark in by_id.items() if landmark.cov is not None}
     boards = _boards(by_id.values(), config)
-    given |= {i: cov[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for ids, cov in boards for j, i in enumerate(ids)}
+    given |= dict(pair for board in boards for pair in board.alone())
     if len(by_id) <= most:
         sigmas |= {f"map.{i}.{name}": v for i, place in places.items() for name, v in place.items()}
         return Installation(sigmas | ground, given, effects, length, gates, boards)
     # one by one markers of a board would tell more of it than they know together
-    given |= {i: len(ids) * given[i] for ids, _ in boards for i in ids}
+    given |= {i: len(board.ids) * given[i] for board in boards for i in board.ids}
     made = Installation(sigmas | ground, None, effects, length, gates, boards)
     made.stateless = {
         i: _prior(place, given.get(i)) for i, place in places.items() if i in given or any(place.values())
@@ -456,21 +490,20 @@ def installation_of(
     return made
 
 
-def _boards(landmarks: Iterable[Landmark], config: Config) -> list[tuple[list[int], FloatArray]]:
-    """Markers of each board that is not known exactly, and the covariance ``(6 k, 6 k)`` of their places together."""
+def _boards(landmarks: Iterable[Landmark], config: Config) -> list[BoardPrior]:
+    """Boards that are not known exactly."""
     m, r = config.map.position_sigma_m, config.map.rotation_sigma_rad
-    on: dict[int, list[Landmark]] = {}
+    on: dict[int, list[tuple[int, Board, FloatArray]]] = {}
     for landmark in landmarks:
-        if landmark.board is not None and landmark.size_m > 0.0 and (m > 0.0 or landmark.board[0].cov is not None):
-            on.setdefault(id(landmark.board[0]), []).append(landmark)
+        if landmark.board is not None and (m > 0.0 or landmark.board[0].cov is not None):
+            on.setdefault(id(landmark.board[0]), []).append((landmark.landmark_id, *landmark.board))
     found = []
     for members in on.values():
-        pairs = [one.board for one in members if one.board is not None]
-        board, A = pairs[0][0], np.vstack([lever for _, lever in pairs])
+        board = members[0][1]
         cov = np.diag([m**2] * 3 + [r**2] * 3) if board.cov is None else board.cov
-        least = max(board.sigma_m, _HELD)
-        own = np.diag(np.tile([least**2] * 3 + [_HELD**2] * 3, len(members)))
-        found.append(([one.landmark_id for one in members], A @ cov @ A.T + own))
+        own = np.square([max(board.sigma_m, _HELD)] * 3 + [_HELD] * 3)
+        ids, levers = tuple(i for i, _, _ in members), np.vstack([lever for _, _, lever in members])
+        found.append(BoardPrior(ids, levers, cov, own))
     return found
 
 

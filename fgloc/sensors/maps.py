@@ -25,6 +25,7 @@ A rigid board of markers is one entry, placed as a marker is; its markers are di
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -230,6 +231,8 @@ def load_map(
             f"got the keys {', '.join(k for k, _ in root.pairs())}"
         )
     if landmarks is not None and landmarks.is_mapping:
+        if (boards := root.get("boards")) is not None:
+            raise boards.fail("boards beside columns of landmarks; give each landmark its own entry")
         return _columns(path, root, landmarks, builder)
     return _ours(path, root, builder)
 
@@ -245,7 +248,9 @@ def configured_map(path: Path, config: Config, default_size_m: float | None = No
 
 
 def write_map(landmark_map: LandmarkMap, path: Path) -> None:
-    """Write our format, whole or not at all. Reading it gives the same map to the last bit but for rotations (1e-15).
+    """Write our format, whole or not at all; boards as bundles.
+
+    Reading it gives the same map to the last bit but for rotations and boards (1e-15).
 
     Raises:
         OutputError: the file cannot be written.
@@ -253,9 +258,25 @@ def write_map(landmark_map: LandmarkMap, path: Path) -> None:
     from scipy.spatial.transform import Rotation  # takes a fifth of a second to load, and reading needs none
 
     lines = [f"dictionary: {landmark_map.dictionary}"] if landmark_map.dictionary else []
-    lines.append("landmarks:")
-    for number in sorted(landmark_map.landmarks):
-        landmark = landmark_map.landmarks[number]
+    on: dict[int, list[Landmark]] = {}
+    alone: list[Landmark] = []
+    for _, landmark in sorted(landmark_map.landmarks.items()):
+        (alone if landmark.board is None else on.setdefault(id(landmark.board[0]), [])).append(landmark)
+    lines += ["boards:"] * bool(on)
+    for members in on.values():
+        board, R, origin = _board_pose(members[0])
+        fields = [f"position: {_row(origin)}", f"quaternion: {_row(Rotation.from_matrix(R).as_quat())}"]
+        fields += sigma_fields(replace(members[0], cov=board.cov))
+        lines.append(f"  - {{kind: bundle, {', '.join(fields)}, markers_sigma_m: {board.sigma_m!r}, markers: [")
+        for one in members:
+            quaternion = Rotation.from_matrix(R.T @ one.rotation).as_quat()
+            fields = [f"id: {one.landmark_id}", f"position: {_row(R.T @ (one.position - origin))}"]
+            fields += [f"quaternion: {_row(quaternion)}", *([f"size: {one.size_m!r}"] if one.size_m > 0.0 else [])]
+            lines.append(f"      {{{', '.join(fields)}}},")
+        lines.append("    ]}")
+    lines += ["landmarks:"] * (bool(alone) or not on)
+    for landmark in alone:
+        number = landmark.landmark_id
         fields = [f"id: {number}", f"position: {_row(landmark.position)}"]
         if landmark.size_m > 0.0:
             quaternion = Rotation.from_matrix(landmark.rotation).as_quat()
@@ -264,6 +285,15 @@ def write_map(landmark_map: LandmarkMap, path: Path) -> None:
         lines.append(f"  - {{{', '.join(fields)}}}")
     with atomic_file(path) as file:
         file.write("\n".join(lines) + "\n")
+
+
+def _board_pose(landmark: Landmark) -> tuple[Board, FloatArray, FloatArray]:
+    """Board that a marker is on, its rotation ``(3, 3)`` and position ``(3,)`` in the map, by the marker's."""
+    assert landmark.board is not None
+    board, lever = landmark.board
+    R = landmark.rotation @ lever[3:, 3:]
+    across = lever[:3, 3:] @ R.T  # of a vector: its cross product with the way from the board to the marker
+    return board, R, landmark.position - np.array([across[1, 2], across[2, 0], across[0, 1]])
 
 
 def _ours(path: Path, root: Item, builder: _Builder) -> LandmarkMap:
@@ -344,7 +374,11 @@ def _printed(item: Item, builder: _Builder) -> Iterator[_Member]:
     first = 0 if named is None else _id(named)
     if not all(1 <= n <= _MOST_ON_BOARD for n in shape):
         raise item.fail(f"board of {shape[0]} columns and {shape[1]} rows, expected 1 to {_MOST_ON_BOARD} of each")
-    side = builder.side(item.get("size"))
+    side = builder.side(item.get("size")) or builder.size(item.need("size"))
+    if kept is not None and kept.text().lower() not in ("true", "false"):
+        raise kept.fail(f"legacy is '{kept.text()}', expected true or false")
+    if first + shape[0] * shape[1] > MAX_LANDMARK_ID:
+        raise item.fail(f"first_id {first} is too large; ids are at most {MAX_LANDMARK_ID}")
     codes = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)  # the geometry is the same for all
     ids = np.arange(first, first + shape[0] * shape[1], dtype=np.int32)
     try:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from fgloc.ablation.failures import MovedMarker
+from fgloc.calibration.installation import map_found
 from fgloc.config import Config
+from fgloc.diagnosis.setup import mirrored
 from fgloc.errors import MapError
 from fgloc.frames import rotation_of
-from fgloc.graph.installation import installation_of
-from fgloc.sensors.maps import load_map
+from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
+from fgloc.sensors.failures import Scene
+from fgloc.sensors.maps import load_map, write_map
 from fgloc.types import FloatArray, LandmarkMap
 
 GRID = "kind: aruco_grid, columns: 4, rows: 3, size: 0.08, gap: 0.02, first_id: 3"
@@ -109,6 +114,92 @@ def test_boards_of_a_map_with_more_landmarks_than_states_keep_their_sigma(tmp_pa
     assert np.sqrt(sum(cov[0, 0] for cov in covs.values())) / len(covs) > 0.02
 
 
+def mean_sigma(installation: Installation, belief: InstallationEstimate) -> float:
+    """Sigma [m] of the mean x of all landmarks."""
+    row = np.zeros(len(installation))
+    for first, _ in installation.landmarks.values():
+        row[first] = 1.0 / len(installation.landmarks)
+    return float(np.sqrt(row @ belief.cov @ row))
+
+
+@pytest.mark.parametrize("head", ["size: 0.1\n", ""])
+def test_markers_seen_as_points_are_displaced_together_too(tmp_path: Path, head: str) -> None:
+    """Poses of markers by others need no size, and their places are states in the plane."""
+    installation = installation_of(Config(), board_map(tmp_path, f"{BUNDLE}, {PLACE}, {SIGMAS}", head), corners=False)
+    assert {count for _, count in installation.landmarks.values()} == {2}
+    prior = installation.prior()
+    first, second = (start for start, _ in installation.landmarks.values())
+    assert prior.cov[first, second] == pytest.approx(0.02**2, rel=0.1)
+    assert mean_sigma(installation, prior) > 0.0199
+
+
+def test_a_board_of_a_thousand_markers_takes_no_memory_of_their_square(tmp_path: Path) -> None:
+    many = board_map(tmp_path, f"{GRID}, {PLACE}, {SIGMAS}".replace("columns: 4, rows: 3", "columns: 50, rows: 40"))
+    tracemalloc.start()
+    installation_of(Config(), many, corners=True)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 100e6
+
+
+@pytest.mark.parametrize("fields", [GRID, CHESS, BUNDLE])
+@pytest.mark.parametrize("sigmas", [SIGMAS, "markers_sigma_m: 0.002"])
+def test_a_map_that_is_written_has_its_boards(tmp_path: Path, fields: str, sigmas: str) -> None:
+    before = board_map(tmp_path, f"{fields}, {PLACE}, {sigmas}")
+    write_map(before, tmp_path / "again.yaml")
+    again = load_map(tmp_path / "again.yaml")
+    assert list(again.landmarks) == list(before.landmarks)
+    for number, one in before.landmarks.items():
+        other = again.landmarks[number]
+        assert np.allclose(other.position, one.position, atol=1e-12)
+        assert np.allclose(other.rotation, one.rotation, atol=1e-12)
+        assert other.size_m == one.size_m
+    old, new = (installation_of(Config(), m, corners=True).prior().cov for m in (before, again))
+    assert np.allclose(new, old, rtol=1e-9, atol=1e-12)
+
+
+def test_a_map_with_a_moved_marker_keeps_its_board(tmp_path: Path) -> None:
+    """A sweep writes it to a file for the run."""
+    before = board_map(tmp_path, f"{GRID}, {PLACE}, {SIGMAS}")
+    scene = Scene(0, 1.0, Config(), (5,), np.random.default_rng(1))
+    moved = MovedMarker(ids=(5,)).corrupt_map(before, scene)
+    write_map(moved, tmp_path / "moved.yaml")
+    read = load_map(tmp_path / "moved.yaml")
+    assert np.linalg.norm(read.landmarks[5].position - before.landmarks[5].position) == pytest.approx(0.3)
+    assert np.allclose(read.landmarks[6].position, before.landmarks[6].position)
+    installation = installation_of(Config(), read, corners=True)
+    assert mean_sigma(installation, installation.prior()) > 0.0199
+
+
+def test_what_is_found_of_a_board_is_no_surer_in_the_next_run(tmp_path: Path) -> None:
+    """A run that has measured the board's height, and along x has hardly seen it, tells of x as much as was known."""
+    given = board_map(tmp_path, f"{GRID}, {PLACE}, {SIGMAS}")
+    installation = installation_of(Config(), given, corners=True)
+    prior, z = installation.prior(), installation.landmarks[7][0] + 2
+    gain = prior.cov[:, z] / (prior.cov[z, z] + 1e-6)
+    belief = InstallationEstimate(0.01 * gain, prior.cov - np.outer(gain, prior.cov[z]))
+    write_map(map_found(given, installation, belief), tmp_path / "found.yaml")
+    read = load_map(tmp_path / "found.yaml")
+    again = installation_of(Config(), read, corners=True)
+    assert mean_sigma(again, again.prior()) == pytest.approx(mean_sigma(installation, belief), rel=0.01)
+    assert again.prior().cov[z, z] < 2.0 * belief.cov[z, z] + 1e-6
+    assert read.landmarks[7].position[2] - given.landmarks[7].position[2] == pytest.approx(0.01, rel=0.01)
+
+
+def test_a_map_in_a_mirror_has_no_boards(tmp_path: Path) -> None:
+    assert all(m.board is None for m in mirrored(board_map(tmp_path, f"{GRID}, {PLACE}")).landmarks.values())
+
+
+def test_boards_beside_columns_of_landmarks_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="columns"):
+        board_map(tmp_path, f"{GRID}, {PLACE}", "landmarks: {id: [90], x: [0], y: [1]}\n")
+
+
+def test_a_board_without_a_size_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="'size' is missing"):
+        board_map(tmp_path, f"{GRID}, {PLACE}".replace("size: 0.08, ", ""), "")
+
+
 def test_an_exact_map_has_exact_boards(tmp_path: Path) -> None:
     landmarks = board_map(tmp_path, f"{GRID}, {PLACE}")
     exact = Config.model_validate({"map": {"position_sigma_m": 0.0, "rotation_sigma_rad": 0.0}})
@@ -144,6 +235,9 @@ def test_a_board_in_other_units(tmp_path: Path) -> None:
         (f"{GRID}, {PLACE}, sigma_m: 0.1", ["sigma_rad"]),
         (f"{GRID}, {PLACE}, markers_sigma_m: 0", ["0", "more than 0"]),
         (f"{GRID}, {PLACE}, square: 0.1", ["square"]),
+        (f"{GRID}, {PLACE}".replace("first_id: 3", "first_id: 2147483640"), ["2147483640"]),
+        (f"{CHESS}, {PLACE}, first_id: 2147483647", ["2147483647"]),
+        (f"{CHESS}, {PLACE}, legacy: yes", ["yes", "true or false"]),
         (f"{BUNDLE}, {PLACE}".replace("id: 2", "id: 1"), ["landmark id 1"]),
         (f"{BUNDLE}, {PLACE}".replace("id: 2", "id: -2"), ["-2"]),
     ],
