@@ -254,6 +254,9 @@ def _turned(config: Config, matched: Matched) -> Finding | None:
     spread = float(np.median(np.abs(se2.wrap_array(off - mean)))) * MAD
     size, extent = size_of(matched), float(np.hypot(*matched.truth[:, :2].std(axis=0)))
     agree = size is not None and ate_rmse_m(matched) < _AGREE * extent
+    true, own = (float(np.ptp(np.unwrap(poses[:, 2]))) for poses in (matched.truth, matched.estimate))
+    if true < _NO_YAW_RAD < _TURNED_RAD < own:
+        return None  # the truth has no yaw
     if not agree or abs(mean) < _TURNED_RAD or spread > _AGREE * abs(mean):
         return None
     offset = round(math.remainder(config.truth.yaw_offset_rad - mean, math.tau), 3)
@@ -265,6 +268,7 @@ def _turned(config: Config, matched: Matched) -> Finding | None:
 
 
 _TURNED_RAD = 0.1  # yaw of a truth that is worth a word
+_NO_YAW_RAD = 1e-3  # turn of a truth that has none
 _AGREE = 0.25  # largest error of positions over the path's extent, and spread of the yaw over what it is off by
 
 

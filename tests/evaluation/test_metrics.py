@@ -7,6 +7,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from scipy.stats import chi2
 
 from fgloc import se2
+from fgloc.config import Config
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation import metrics
 from fgloc.evaluation import metrics as consistency
@@ -238,3 +239,19 @@ def test_honest_dead_reckoning_is_called_honest_where_the_truths_frame_is_fitted
     assert 0.5 < np.mean(values) < 1.5
     plain = np.mean(consistency.nees(matched.errors, matched.covs)) / 3.0
     assert plain > 10.0 * values[-1]
+
+
+@pytest.mark.parametrize(("truth", "named"), [("of its own", False), ("turned", True), ("none", False)])
+def test_a_truth_without_a_yaw_is_no_body_that_is_turned(truth: str, named: bool) -> None:
+    """A robot that drives in waves along one direction: of a truth whose yaw is 0 all along it is off by one angle."""
+    t = np.linspace(0.0, 30.0, 301)
+    yaw = 1.2 + 0.1 * np.sin(t)
+    path = np.cumsum(0.1 * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0)
+    true = {"of its own": yaw, "turned": yaw - 0.5, "none": np.zeros(len(t))}[truth]
+    matched = Matched(
+        np.arange(len(t)), np.column_stack([path, yaw]), np.column_stack([path + 0.01, true]), None, np.zeros(3)
+    )
+    finding = metrics._turned(Config(), matched)
+    assert (finding is not None) is named
+    if finding is not None:
+        assert float(finding.lines["truth.yaw_offset_rad"]) == pytest.approx(-0.5, abs=0.01)
