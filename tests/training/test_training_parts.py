@@ -14,15 +14,16 @@ from scipy.signal import lfilter
 from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 
 from fgloc import se2
-from fgloc.config import NoiseDensity
+from fgloc.config import NoiseDensity, config_of
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.files.outputs import write_covariance_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
+from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import ControlEvent, Trajectory
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from fgloc_training.config import CalibrationConfig, DataConfig, OptimizationConfig
-from fgloc_training.data import Run, cut, load_run, make_run
+from fgloc_training.data import Run, SensorRecord, cut, load_run, make_run
 from fgloc_training.models import integrate, relative
 from fgloc_training.optimize import composed_nll, end_errors, rollout_loss
 from fgloc_training.rollouts import Rollout, adjoints, inverses, logs, roll_kinematics
@@ -280,6 +281,15 @@ def noisy_rollouts(
             Rollout(run, 0.2, exact.motions, covs, exact.track, np.array(track), np.ones(len(track), dtype=bool))
         )
     return out
+
+
+@pytest.mark.parametrize(("names", "rolls"), [(("speed", "steering_angle"), True), (("shoulder", "elbow"), False)])
+def test_joints_of_an_arm_are_no_wheels_of_a_car_that_is_commanded(names: tuple[str, ...], rolls: bool) -> None:
+    """Its drive is given for what the steering angles of the commands mean."""
+    commands, stamps, _ = drive(np.random.default_rng(0), 5.0)
+    made = [JointsEvent(int(s), int(s), "/joints", names, np.zeros(2), np.zeros(2), np.zeros(0)) for s in stamps[::6]]
+    car = config_of({"wheels": {"drive": {"kind": "ackermann", "wheelbase": 0.5}}})
+    assert SensorRecord([*commands, *made], car).has_wheels is rolls
 
 
 NOISE = NoiseDensity(x_per_sqrt_m=0.05, y_per_sqrt_m=0.02, yaw_per_sqrt_m=0.05, yaw_per_sqrt_rad=0.1)

@@ -87,8 +87,12 @@ class SensorRecord:
         """Whether wheel odometry comes from wheels, not from commands."""
         if self.wheels.source in ("command", "none"):
             return False
-        w = self.wheels
-        by_joints = bool(self._stamps(JointsEvent)) and (w.left_radius is not None or w.drive is not None)
+        drive = self.wheels.drive
+        if drive is None:
+            by_joints = bool(self._stamps(JointsEvent)) and self.wheels.left_radius is not None
+        else:
+            names = {*drive.driven, *drive.steered}  # others are an arm's
+            by_joints = any(names <= {*event.names} for event in self._all(JointsEvent))
         return by_joints or bool(self._stamps(OdometryEvent))
 
     @property
