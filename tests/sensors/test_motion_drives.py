@@ -118,6 +118,7 @@ def test_a_steering_angle_is_the_yaw_rate_that_the_drive_makes_of_it(tmp_path: P
         ("displacement", {"inputs": ("commands", "sideways")}),
         ("displacement", {"kinematics": SCALES}),
         ("velocity", {"inputs": ("commands", "velocity", "sideways")}),
+        ("displacement", {"wheel_kinematics": SCALES}),
     ],
 )
 def test_cards_that_do_not_fit_a_sideways_drive_are_refused(kind: str, changes: dict[str, object]) -> None:

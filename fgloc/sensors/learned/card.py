@@ -226,6 +226,8 @@ class ModelCard(Section):
             need = "more than 0" if "sideways" in self.inputs else "0"
             given = f"kinematics.scale_vy is {self.kinematics.scale_vy:g}"
             raise ValueError(f"{given}, the inputs {', '.join(self.inputs)} need {need}")
+        if self.wheel_kinematics.scale_vy > 0.0:
+            raise ValueError(f"wheel_kinematics.scale_vy is {self.wheel_kinematics.scale_vy:g}, wheels' is 0")
         n_scales = self.n_outputs if self.family != "displacement" else 3
         for name, values, wanted in (
             ("input_mean", self.input_mean, self.n_inputs),
