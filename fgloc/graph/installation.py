@@ -208,13 +208,20 @@ class Installation:
         return rows, of
 
     def boards_found(self, belief: InstallationEstimate) -> Iterator[tuple[tuple[int, ...], FloatArray]]:
-        """Markers of each board whose markers are all states, and the covariance ``(6, 6)`` of the board's pose now."""
+        """Markers of each board whose markers are all states, and the covariance ``(6, 6)`` of the board's pose now.
+
+        Left out: where by rounding it is none.
+        """
         for board in self._boards:
             if all(i in self.landmarks for i in board.ids):
                 rows, of = self._rows_on(board)
-                gain = np.linalg.solve(board.joint(of), board.derivative[of] @ board.cov).T
-                cov = board.cov + gain @ (belief.cov[np.ix_(rows, rows)] - board.joint(of)) @ gain.T
-                yield board.ids, 0.5 * (cov + cov.T)
+                A = board.derivative[of]
+                weighted = A.T / board.own[of % len(MARKER)]
+                left = np.linalg.inv(np.linalg.inv(board.cov) + weighted @ A)  # if the markers' poses were known
+                gain = left @ weighted
+                cov = left + gain @ belief.cov[np.ix_(rows, rows)] @ gain.T
+                if np.linalg.eigvalsh(cov)[0] > 0.0:
+                    yield board.ids, 0.5 * (cov + cov.T)
 
     @property
     def vacancies(self) -> int:

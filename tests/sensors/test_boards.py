@@ -186,6 +186,17 @@ def test_what_is_found_of_a_board_is_no_surer_in_the_next_run(tmp_path: Path) ->
     assert read.landmarks[7].position[2] - given.landmarks[7].position[2] == pytest.approx(0.01, rel=0.01)
 
 
+def test_a_covariance_that_is_none_by_rounding_leaves_the_board_as_it_was(tmp_path: Path) -> None:
+    given = board_map(tmp_path, f"{GRID}, {PLACE}, {SIGMAS}")
+    installation = installation_of(Config(), given, corners=True)
+    for variance in (1e-8, -1e-6):
+        belief = InstallationEstimate(np.zeros(len(installation)), variance * np.eye(len(installation)))
+        found = map_found(given, installation, belief)
+        board, _ = found.landmarks[7].board or pytest.fail("no board")
+        assert board.cov is not None
+        assert np.sqrt(board.cov[0, 0]) == pytest.approx(0.02 if variance < 0.0 else 1.5e-4, rel=0.2)
+
+
 def test_a_map_in_a_mirror_has_no_boards(tmp_path: Path) -> None:
     assert all(m.board is None for m in mirrored(board_map(tmp_path, f"{GRID}, {PLACE}")).landmarks.values())
 
