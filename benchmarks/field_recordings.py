@@ -81,7 +81,7 @@ class Recording:
 
 def window(recording: Recording, first: float, last: float) -> Recording:
     """The part of a recording between two shares of its time, as a recording of its own."""
-    name = f"{recording.name}_{100.0 * first:.0f}_{100.0 * last:.0f}"
+    name = f"{recording.name}_{1000.0 * first:.0f}_{1000.0 * last:.0f}"
     return replace(recording, name=name, make=partial(_window, recording, first, last), development=True)
 
 

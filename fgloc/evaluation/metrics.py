@@ -252,8 +252,7 @@ def _turned(config: Config, matched: Matched) -> Finding | None:
     off = se2.wrap_array(matched.errors[:, 2])
     mean = float(np.angle(np.exp(1j * off).mean()))
     spread = float(np.median(np.abs(se2.wrap_array(off - mean)))) * MAD
-    size, extent = size_of(matched), float(np.hypot(*matched.truth[:, :2].std(axis=0)))
-    agree = size is not None and ate_rmse_m(matched) < _AGREE * extent
+    agree = ate_rmse_m(matched) < _AGREE * float(np.hypot(*matched.truth[:, :2].std(axis=0)))
     true, own = (float(np.ptp(np.unwrap(poses[:, 2]))) for poses in (matched.truth, matched.estimate))
     if true < _NO_YAW_RAD < _TURNED_RAD < own:
         return None  # the truth has no yaw

@@ -534,7 +534,7 @@ def test_a_truth_in_another_frame_is_named_and_blames_no_covariance(tmp_path):
 
 
 def test_a_truth_whose_body_is_turned_is_named_in_a_short_run_too_and_blames_no_covariance(tmp_path):
-    """What the recording tells of it before the run needs more windows than a few seconds have."""
+    """The comparison before the run needs more windows than a few seconds have; the run itself shows it."""
     bag = write_circle(tmp_path, seconds=6.0)
     (tmp_path / "robot.yaml").write_text("truth: {yaw_offset_rad: -1.2}\n")
     assert fgloc("smooth", bag, "--out", tmp_path / "turned")[0] == 0

@@ -80,7 +80,7 @@ def test_a_robot_that_is_commanded_to_the_side_is_predicted_at_any_time(tmp_path
 
 
 def test_a_command_to_the_side_that_is_no_number_is_passed_over(tmp_path: Path) -> None:
-    """As wheels pass it over; the next ones are read again."""
+    """The command is passed over, and the next ones are read again."""
     model = sideways_model(tmp_path / "m.safetensors", np.random.default_rng(1), "displacement", 0.0)
     learned = LearnedMotion(model, MotionConfig(use=True))
     events = [command(0.0, 0.3, 0.0, -0.2), command(0.5, 0.3, 0.0, math.nan), command(1.0, 0.3, 0.0, -0.2)]

@@ -88,7 +88,7 @@ def test_torch_and_numpy_agree(kind: str, inputs: tuple[Input, ...], runs: dict[
 def test_a_model_that_reads_no_commands_to_the_side_is_made_though_they_are_named(
     kind: Kind, runs: dict[str, Run]
 ) -> None:
-    """As it passes over other inputs: `train --init` names them whatever kind is chosen later."""
+    """The input `sideways` is passed over: `train --init` names it whatever kind is chosen later."""
     network = NetworkConfig(kind=kind, hidden=(8, 8), inputs=("commands", "sideways"))
     config = TrainConfig(robot="r", recordings={n: Path(n) for n in runs}, leave_one_out=True, network=network)
     net = new_net(network, [runs["run0"]])
