@@ -21,7 +21,7 @@ has a frame of its own always.
 - ``field.beyond_gate``: constants that were used more than 4 prior sigmas from what was given.
 
 ``--windows N``: N windows of each recording that has a truth and landmarks, of a fifth to seven tenths of it, drawn by
-``--seed``, in place of the recordings.
+``--seed``, in place of the recordings; with ``--unmapped`` without the sets' maps.
 
 - ``field.window.lost``: runs that end with 0 although their ATE is over twice that of odometry and of the textbook
   begun alike, and 5 cm more, and NEES/3 over 6: whose covariance is wrong, too.
@@ -253,8 +253,8 @@ def measure(quick: bool, only: Sequence[str] = (), page: Path | None = None) -> 
         write_page(page, chosen, outcomes)
 
 
-def windows(count: int, seed: int, only: Sequence[str] = ()) -> Iterator[Row]:
-    """Rows of windows of the recordings."""
+def windows(count: int, seed: int, only: Sequence[str] = (), mapped: bool = True) -> Iterator[Row]:
+    """Rows of windows of the recordings; ``mapped``: with the sets' maps."""
     if not DATA.is_dir():
         yield from not_run(["field.window.lost"], f"no {DATA}; set FGLOC_REAL_DATA")
         return
@@ -264,7 +264,7 @@ def windows(count: int, seed: int, only: Sequence[str] = ()) -> Iterator[Row]:
             share = rng.uniform(0.2, 0.7)
             first = rng.uniform(0.0, 1.0 - share)
             if not only or recording.name in only:
-                chosen.append(window(recording, first, first + share))
+                chosen.append(window(recording, first, first + share, mapped))
     with ThreadPoolExecutor(_WORKERS) as pool:
         outcomes = dict(zip(chosen, pool.map(outcome, chosen), strict=True))
     for r, o in outcomes.items():
@@ -481,11 +481,14 @@ if __name__ == "__main__":
     parser.add_argument("--page", type=Path, metavar="FILE.md", help="also write the table as a page")
     parser.add_argument("--windows", type=int, default=0, metavar="N", help="of each recording; default: the whole")
     parser.add_argument("--seed", type=int, default=0, help="of the windows")
+    parser.add_argument("--unmapped", action="store_true", help="windows without the sets' maps")
     known, rest = parser.parse_known_args()
     named = tuple(filter(None, known.only.split(",")))
 
     def rows(quick: bool) -> Iterator[Row]:
         """Rows of windows, or of the recordings."""
-        return windows(known.windows, known.seed, named) if known.windows else measure(quick, named, known.page)
+        if known.windows:
+            return windows(known.windows, known.seed, named, not known.unmapped)
+        return measure(quick, named, known.page)
 
     main(rows, __doc__ or "", rest)

@@ -79,13 +79,14 @@ class Recording:
         return path if path.is_file() else None
 
 
-def window(recording: Recording, first: float, last: float) -> Recording:
-    """The part of a recording between two shares of its time, as a recording of its own."""
+def window(recording: Recording, first: float, last: float, mapped: bool = True) -> Recording:
+    """The part of a recording between two shares of its time, as a recording of its own; without its map if wished."""
     name = f"{recording.name}_{1000.0 * first:.0f}_{1000.0 * last:.0f}"
-    return replace(recording, name=name, make=partial(_window, recording, first, last), development=True)
+    part = replace(recording, name=name, make=partial(_window, recording, first, last, mapped), development=True)
+    return part if mapped else replace(part, map="", frame="se2")
 
 
-def _window(recording: Recording, first: float, last: float, _: Path, out: Path) -> None:
+def _window(recording: Recording, first: float, last: float, mapped: bool, _: Path, out: Path) -> None:
     with TemporaryDirectory() as scratch:
         whole = recording.bag(Path(scratch))
         if whole.suffix == ".bag":
@@ -103,7 +104,7 @@ def _window(recording: Recording, first: float, last: float, _: Path, out: Path)
                 latched = any(name in connection.topic for name in ("static", "camera_info"))
                 if begin <= stamp_ns <= end or (latched and stamp_ns < begin):
                     writer.write(topics[connection.id], max(stamp_ns, begin), raw)
-        if found_map is not None and not recording.map:
+        if mapped and found_map is not None and not recording.map:
             copy(found_map, out / "map.yaml")
 
 

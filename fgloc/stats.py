@@ -48,6 +48,14 @@ def _t_bound(probability: float, samples: int) -> float:
     return float(stdtrit(samples, 0.5 + 0.5 * probability) ** 2)
 
 
+def few_samples(samples: int) -> float:
+    """Factor by which a standard deviation that few samples gave is too small for what is five of them away.
+
+    Source: Student 1908, The probable error of a mean.
+    """
+    return math.sqrt(_t_bound(math.erf(5.0 / math.sqrt(2.0)), max(samples - 1, 1))) / 5.0
+
+
 def evidence_bound(probability: float, hypotheses: int) -> float:
     """Twice the log-likelihood ratio of one of several hypotheses to "none" that is seldom reached if none is right.
 

@@ -226,11 +226,17 @@ def _with_initial_pose(config: Config, text: str | None) -> Config:
 
 
 def _exit_if_wrong(node: Node) -> None:
-    """Repeat the errors of the run and end with the code of a run that is not to be trusted, if there are any."""
-    from fgloc.types import Severity
+    """End with the code of a run that is not to be trusted, and why: by its errors, or as its last pose is not of now."""
+    from fgloc.types import Mode, Severity
 
-    findings = () if node.live is None else node.live.status().findings
-    wrong = [f.text for f in findings if f.severity is Severity.ERROR]
+    if node.live is None:
+        return
+    status = node.live.status()
+    wrong = [f.text for f in status.findings if f.severity is Severity.ERROR]
+    if status.mode is Mode.LOST:
+        wrong.append("LOST: the pose is not known")
+    if status.stale:
+        wrong.append(status.stale)
     for text in wrong:
         say_remark("error", text, err=True)
     if wrong:

@@ -31,6 +31,7 @@ from fgloc.diagnosis.pairs import (
     jackknife,
 )
 from fgloc.diagnosis.signals import Path, Sightings
+from fgloc.stats import few_samples
 from fgloc.types import FloatArray, IntArray
 
 _LAG_STEP_S = 0.05
@@ -127,22 +128,18 @@ def fit_sightings(
     if len(first) < 60:
         return {}
     names = names or (list(AXES) if seen.spatial else ["body", "body, upside down"])
-    lags = np.arange(-MOST_LAG_S, MOST_LAG_S + 1e-9, _LAG_STEP_S)
-    poses = [
-        (*complex_poses(path, seen.times[first] - lag), *complex_poses(path, seen.times[last] - lag)) for lag in lags
-    ]
-    found = {}
-    for name in names:
-        z = planar(seen.points, name)
-        fits = [_similarity(at_lag, z[first], z[last]) for at_lag in poses]
-        best = min(range(len(fits)), key=lambda k: fits[k][2])
-        alpha, beta, misfit = fits[best]
-        if np.isfinite(misfit):
-            found[name] = (misfit, float(lags[best]), alpha, beta, z)
+    planes = {name: planar(seen.points, name) for name in names}
+    found: dict[str, tuple[float, float, complex, complex]] = {}
+    for late in np.arange(-MOST_LAG_S, MOST_LAG_S + 1e-9, _LAG_STEP_S).tolist():
+        poses = (*complex_poses(path, seen.times[first] - late), *complex_poses(path, seen.times[last] - late))
+        for name, z in planes.items():
+            alpha, beta, misfit = _similarity(poses, z[first], z[last])
+            if misfit < found.get(name, (math.inf,))[0]:
+                found[name] = (misfit, late, alpha, beta)
     least = min((f[0] for f in found.values()), default=math.inf)
     return {
-        name: _refined(path, seen, name, z, late, alpha, beta, len(first), turn_sigma)
-        for name, (misfit, late, alpha, beta, z) in found.items()
+        name: _refined(path, seen, name, planes[name], late, alpha, beta, len(first), turn_sigma)
+        for name, (misfit, late, alpha, beta) in found.items()
         if misfit < 5.0 * least or name == "body"
     }
 
@@ -213,8 +210,10 @@ def _refined(
     typical = part.misfit(x)
     blocks = np.minimum(((times - times[0]) / max(times[-1] - times[0], 1e-9) * BLOCKS).astype(int), BLOCKS - 1)
     sigmas = np.full(len(x), np.inf)
-    if len(np.unique(tracks)) >= _FEWEST_TRACKS:
-        sigmas = np.hypot(_jackknifed(lambda use: solve(use, x, part.sigma)[0], blocks, _by_landmark(ids)), by_priors)
+    if (samples := len(np.unique(tracks))) >= _FEWEST_TRACKS:
+        by_parts = _jackknifed(lambda use: solve(use, x, part.sigma)[0], blocks, _by_landmark(ids))
+        by_parts[1:4] *= few_samples(samples)  # a mounting is named by nothing but this; a scale by map and wheels
+        sigmas = np.hypot(by_parts, by_priors)
     for k in (1, 4):  # the wheels' noise has more than one place where a yaw or a lag fits a little better
         sigmas[k] = _as_sure(x, k, float(sigmas[k]), part.gain)
     scale, yaw, bx, by, late, turn = x.tolist()

@@ -1,11 +1,17 @@
 """A live run whose inputs have stopped says so, and since when."""
 
-import pytest
+from types import SimpleNamespace
 
+import pytest
+import typer
+
+from fgloc.cli.live import _exit_if_wrong
+from fgloc.cli.terminal import EXIT_LOST
 from fgloc.config import Config
 from fgloc.live import Live, live
+from fgloc.live.engine import LiveStatus
 from fgloc.live.wire.node import described
-from fgloc.types import ControlEvent
+from fgloc.types import ControlEvent, Mode
 
 
 @pytest.fixture
@@ -34,9 +40,13 @@ def test_silence_of_all_motion_is_stale_within_a_second(clock):
         assert described(status)[0] == status.stale
         (topic,) = status.topics.values()
         assert topic.missed
+        with pytest.raises(typer.Exit) as ended:
+            _exit_if_wrong(SimpleNamespace(live=run))
+        assert ended.value.exit_code == EXIT_LOST
         assert topic.silent_s == pytest.approx(0.95, abs=0.06)
         drive(run, clock, 0.5)
         assert not run.status().stale
+        _exit_if_wrong(SimpleNamespace(live=run))
 
 
 def test_a_slow_topic_is_not_missed_between_two_messages(clock):
@@ -44,3 +54,14 @@ def test_a_slow_topic_is_not_missed_between_two_messages(clock):
         drive(run, clock, 20.0, hz=2.0)
         clock[0] += 0.9
         assert not run.status().stale
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_a_run_that_ends_without_its_pose_says_so_in_the_exit_code(mode):
+    node = SimpleNamespace(live=SimpleNamespace(status=lambda: LiveStatus(mode=mode)))
+    if mode is Mode.LOST:
+        with pytest.raises(typer.Exit) as ended:
+            _exit_if_wrong(node)
+        assert ended.value.exit_code == EXIT_LOST
+    else:
+        _exit_if_wrong(node)
