@@ -226,7 +226,7 @@ def _with_initial_pose(config: Config, text: str | None) -> Config:
 
 
 def _exit_if_wrong(node: Node) -> None:
-    """End with the code of a run that is not to be trusted, and why: by its errors, or as its last pose is not of now."""
+    """End with the code of a run that is not to be trusted, and say why: errors, or a last pose that is not of now."""
     from fgloc.types import Mode, Severity
 
     if node.live is None:
