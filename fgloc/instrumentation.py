@@ -135,6 +135,32 @@ class Stopwatch:
                 self.samples.setdefault(phase, []).append(spent)
 
 
+# --- Work in the background -------------------------------------------------------------------------------------------
+
+
+class _Background(threading.local):
+    wait: Callable[[], None] | None = None
+
+
+_background = _Background()
+
+
+@contextmanager
+def giving_way(wait: Callable[[], None]) -> Iterator[None]:
+    """Call ``wait`` at each `give_way` of this thread while the block runs: it returns when others have no work."""
+    _background.wait = wait
+    try:
+        yield
+    finally:
+        _background.wait = None
+
+
+def give_way() -> None:
+    """Let more urgent work go first, if this is the background of it; called every few milliseconds of long work."""
+    if _background.wait is not None:
+        _background.wait()
+
+
 def one_blas_thread(work: Callable[_P, _R]) -> Callable[_P, _R]:
     """Let BLAS use one thread meanwhile: threads that wait for one another cost a step ten times its time."""
 

@@ -609,7 +609,7 @@ class InstallationFound:
     cov: FloatArray  # (n, n)
     prior_cov: FloatArray  # (n, n)
     cameras: tuple[Camera, ...]  # of corners, as the run used them
-    seen_by: str  # role whose stamps the sightings have
+    seen_by: str  # role whose stamps the sightings have; "" if they are of registered sensors alone
     wheels: str  # role whose stamps the wheels have: "joints", "odometry", "command"; "" if they had no messages
     settings: tuple[Setting, ...] = ()  # all but the map's
     landmarks: LandmarkMap | None = None  # of a known map, where they were found

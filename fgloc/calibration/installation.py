@@ -145,7 +145,7 @@ def installation_found(
         belief.cov[:n, :n],
         installation.prior().cov[:n, :n],
         parts.cameras,
-        "image" if "image" in roles else "sightings",
+        "image" if "image" in roles else "sightings" if "sightings" in roles or not parts.sensors else "",
         "joints" if source == "ticks" else source,
     )
     return replace(

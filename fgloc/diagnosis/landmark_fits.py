@@ -31,6 +31,7 @@ from fgloc.diagnosis.pairs import (
     jackknife,
 )
 from fgloc.diagnosis.signals import Path, Sightings
+from fgloc.instrumentation import give_way
 from fgloc.stats import few_samples
 from fgloc.types import FloatArray, IntArray
 
@@ -364,6 +365,7 @@ class _Places:
 
     def residuals(self, x: FloatArray) -> FloatArray:
         """``(2 n + 3,)``: along and across the line of sight, over the range, in units of `sigma`; and the priors."""
+        give_way()
         scale, yaw, bx, by, late, turn = x.tolist()
         alpha, beta = math.exp(min(scale, 50.0)) * np.exp(1j * yaw), complex(bx, by)
         if turn != self._turned[0]:

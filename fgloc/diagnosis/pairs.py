@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fgloc.diagnosis.signals import Path
+from fgloc.instrumentation import give_way
 from fgloc.types import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -72,6 +73,7 @@ def irls(A: ComplexArray, y: ComplexArray, floor: float, prior: float = 0.0) -> 
     weights = np.ones(len(y))
     x, residual = np.zeros(A.shape[1], dtype=complex), np.abs(y)
     for _ in range(_REWEIGHTED):
+        give_way()
         weighted_rows = A.conj().T * weights
         H = weighted_rows @ A
         H[-1, -1] += prior * weights.sum() / len(y)
@@ -174,6 +176,7 @@ def explained(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     typical = float(np.sqrt(np.mean(np.minimum(np.abs(y - np.median(y)), _CLIPPED * np.std(y)) ** 2)))
     constant = ~np.any(np.abs(x) > 1e-12, axis=1)
     for _ in range(_REWEIGHTED):
+        give_way()
         total = weights.sum(axis=1)
         dx = x - (np.einsum("ij,ij->i", weights, x) / total)[:, None]
         dy = y - (weights @ y / total)[:, None]

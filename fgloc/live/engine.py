@@ -15,7 +15,7 @@ from fgloc.assembly import Assembly
 from fgloc.config import Config, Role, TopicsConfig
 from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.instrumentation import one_blas_thread
+from fgloc.instrumentation import giving_way, one_blas_thread
 from fgloc.live.extrapolation import Outlet
 from fgloc.live.run import MOTION, LiveFacts, OnlineRun, role_name
 from fgloc.live.state import Resumed, fingerprint, read_state, write_state
@@ -125,9 +125,14 @@ class DetectionWorker:
         self._most = most_waiting
         self._images: deque[Queued] = deque()  # from arrival until used
         self._todo: deque[Queued] = deque()
-        self._stopping = False
+        self._detecting = self._stopping = False
         self._thread = threading.Thread(target=self._run, name="fgloc-detection", daemon=True)
         self._thread.start()
+
+    @property
+    def detecting(self) -> bool:
+        """Whether markers are being looked for, or are about to be."""
+        return self._detecting or bool(self._todo)
 
     @property
     def queued(self) -> int:
@@ -171,7 +176,7 @@ class DetectionWorker:
                 while self._todo:
                     image = self._todo.popleft()
                     if isinstance(image.event, RawEvent) and self.detector is not None:
-                        image.state = State.DETECTING
+                        image.state, self._detecting = State.DETECTING, True
                         return image, image.event, self.detector
                 self._changed.wait()
         return None
@@ -189,6 +194,7 @@ class DetectionWorker:
                 self.error = error
                 return self._wake()
             with self._changed:
+                self._detecting = False
                 if reason:
                     self.rejections[f"{self._topics.role_on(event.topic, 'image')}.{reason}"] += 1
                 image.event, image.state = found, State.GONE if found is None else State.READY
@@ -204,6 +210,7 @@ _MEAN_OF = 20  # steps, in the mean of their time
 _SAVE_EVERY_S = 1.0
 _COMPARE_EVERY_S = 0.5  # or less often, where nothing new is to be compared
 _COMPARED_SHARE = 0.03  # of the time, that comparisons may compute: on a slow computer they come less often ...
+_WAY_S = 0.03  # that a comparison waits at a time for the steps, which come first
 _COMPARED_FREELY_S = 1.0  # ... beyond so much: what is wrong from the start is named as soon as it shows
 _UNFOUND = (State.WAITING, State.DETECTING)
 
@@ -527,6 +534,12 @@ class Estimation:
         with self._changed:
             return not self._changed.wait_for(lambda: self._closing or self._failed is not None, seconds)
 
+    def _wait_until_idle(self) -> None:
+        """Wait for a moment in which nothing is estimated or detected, but no longer than a step takes."""
+        if self._working or self._worker.detecting:
+            with self._changed:
+                self._changed.wait_for(lambda: not (self._working or self._worker.detecting), _WAY_S)
+
     def _compare_regularly(self) -> None:
         """Compare signals beside the estimation, which goes on meanwhile, also where this fails."""
         began, free_s = time.monotonic(), _COMPARED_FREELY_S
@@ -536,7 +549,8 @@ class Estimation:
                 comparison = self.run.comparison()
             try:
                 if comparison is not None:
-                    comparison()
+                    with giving_way(self._wait_until_idle):
+                        comparison()
             except Exception as error:
                 with self._changed:
                     self._notes.setdefault(f"sensors are not compared any more: {unexpected(error, 'the comparison')}")

@@ -100,13 +100,17 @@ class LandmarkSensor:
         return tuple(measurers[type(event)](event))
 
     def known(self, measurements: Iterable[LandmarkMeasurement]) -> list[LandmarkMeasurement]:
-        """Measurements but for those of landmarks that the map does not have, which are counted as rejected."""
-        landmark_map, kept = self._context.landmark_map, []
+        """Measurements of a registered sensor, as the settings calibrate sightings.
+
+        Those of landmarks that the map does not have are left out and counted as rejected.
+        """
+        landmark_map, section, kept = self._context.landmark_map, self._context.config.landmarks, []
+        scale, bias_rad = section.range_scale, section.bearing_bias_rad
         for m in measurements:
             if m.of_landmark and (landmark_map is None or not (m.unnamed or m.landmark_id in landmark_map)):
                 self._context.rejections[f"{m.counted_as}.unknown_id"] += 1
             else:
-                kept.append(m)
+                kept.append(m if (scale, bias_rad) == (1.0, 0.0) else m.calibrated(scale, bias_rad))
         return kept
 
 

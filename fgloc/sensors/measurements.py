@@ -158,6 +158,13 @@ class LandmarkMeasurement(Protocol):
         """
         ...
 
+    def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
+        """Copy with distance and bearing corrected by the settings of `LandmarksConfig` that a run estimates.
+
+        The built-in sensors of landmarks have applied them already.
+        """
+        ...
+
     def scaled(self, factor: float) -> Self:
         """Copy with the covariance of the residual multiplied by a factor."""
         ...
@@ -234,6 +241,10 @@ class _OfLandmark:
     def row_id(self) -> int:
         """Id of the landmark."""
         return self.landmark_id
+
+    def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
+        """The sighting itself: corners have the camera's calibration."""
+        return self
 
     def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
         """No alternatives but other ids; see `misread`."""
@@ -416,6 +427,12 @@ class PointMeasurement(_InPlane):
         """Whether the sensor does not say of which landmark it is."""
         return self.landmark_id == UNNAMED
 
+    def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
+        """Copy with range and bearing corrected; see `LandmarkMeasurement.calibrated`."""
+        bearing, scale = self.bearing_rad - bearing_bias_rad, np.array([1.0, range_scale])
+        cov = self.cov * np.outer(scale, scale)
+        return replace(self, range_m=range_scale * self.range_m, bearing_rad=bearing, cov=cov)
+
     @property
     def point(self) -> FloatArray:
         """Position in the base frame ``(2,)`` [m]."""
@@ -500,6 +517,12 @@ class FrameMeasurement(_InPlane):
     twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
     cauchy_k: float = 3.0  # as in PixelMeasurement
+
+    def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
+        """Copy with distance, bearing and yaw corrected; see `LandmarkMeasurement.calibrated`."""
+        scale = np.array([range_scale, range_scale, 1.0])
+        pose = se2.compose(np.array([0.0, 0.0, -bearing_bias_rad]), scale * self.pose)
+        return replace(self, pose=pose, cov=self.cov * np.outer(scale, scale))
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
@@ -630,6 +653,10 @@ class PoseMeasurement(ABC):
         known = np.zeros((3, 3)) if self.motion_cov is None else self.motion_cov
         moved = se2.compose_cov(cov, self.T_keyframe_then, known)
         return replace(self, T_keyframe_then=se2.compose(motion, self.T_keyframe_then), motion_cov=moved)
+
+    def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
+        """The measurement itself: its sensor has constants of its own."""
+        return self
 
     def scaled(self, factor: float) -> Self:
         """Copy with the covariance multiplied by a factor."""

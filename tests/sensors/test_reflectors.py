@@ -46,6 +46,8 @@ class Drive:
         turn_s: that the scanner takes for a turn.
         placed: whether tf has the place of the scanner.
         intensities: whether the scans have any.
+        stretch: of its ranges.
+        turned_rad: of its directions, to the left.
     """
 
     places: tuple[tuple[float, float], ...] = ROOM
@@ -56,6 +58,8 @@ class Drive:
     turn_s: float = 0.0
     placed: bool = False
     intensities: bool = True
+    stretch: float = 1.0
+    turned_rad: float = 0.0
 
     def write(self, folder):
         """Bag of odometry, scans and truth, the map beside it."""
@@ -89,10 +93,10 @@ class Drive:
             then = se2.compose(pose, se2.exp(np.multiply(twist, beam_s)))
             x, y, _ = se2.between(se2.compose(then, MOUNTED), (*place, 0.0))
             distance = math.hypot(x, y)
-            middle = np.round((math.atan2(y, x) + rng.normal(0.0, 0.004) + math.pi) / step)
+            middle = np.round((math.atan2(y, x) + self.turned_rad + rng.normal(0.0, 0.004) + math.pi) / step)
             seen = np.add(middle, (-1, 0, 1)) % BEAMS
             wide = seen[[0, 1, 2] if distance < 6.0 else [1]].astype(int)
-            ranges[wide] = distance + rng.normal(0.0, 0.02)
+            ranges[wide] = self.stretch * distance + rng.normal(0.0, 0.02)
             intensities[wide] = BRIGHT
         bearings = (-math.pi, math.pi - step)
         shown = intensities if self.intensities else ()
@@ -208,6 +212,19 @@ def test_motion_within_a_turn_of_the_scanner_is_taken_out(tmp_path):
     result, metrics = localized(Drive(turn_s=0.2), tmp_path)
     assert metrics.ate_rmse_m < 0.03
     assert abs(result.installation["sightings.time_offset_s"][0]) < 0.03
+
+
+def test_what_a_run_finds_of_the_scanner_calibrates_the_next_one(tmp_path):
+    """A scanner at the base that reports 3 % too much, turned by 2°."""
+    drive = Drive(stretch=1.03, turned_rad=0.035)
+    result, _ = localized(drive, tmp_path / "first", "batch")
+    scale, bearing = (result.installation[f"sightings.{name}"] for name in ("range_scale", "bearing_offset_rad"))
+    assert scale[0] == pytest.approx(1 / 1.03, abs=0.012)
+    landmarks = {"range_scale": scale[0], "bearing_bias_rad": bearing[0]}
+    again, metrics = localized(drive, tmp_path / "again", "batch", landmarks=landmarks)
+    assert abs(again.installation["sightings.range_scale"][0] - 1.0) < 0.5 * abs(scale[0] - 1.0)
+    assert abs(again.installation["sightings.bearing_offset_rad"][0]) < 0.5 * abs(bearing[0])
+    assert metrics.ate_rmse_m < 0.03
 
 
 def test_bright_things_that_the_map_lacks_are_rejected(tmp_path):
