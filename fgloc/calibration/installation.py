@@ -21,7 +21,7 @@ from fgloc.config import CAMERA_ROLES, Config, camera_role, setting
 from fgloc.frames import rotation_of, sensor_pose
 from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate, camera_block
-from fgloc.sensors import registry
+from fgloc.sensors import odometry, registry
 from fgloc.sensors.base import InstallationState
 from fgloc.sensors.cameras import pinhole
 from fgloc.sensors.wheels.motion import DRIVE
@@ -166,6 +166,20 @@ def settings_found(found: InstallationFound, config: Config) -> tuple[Setting, .
     motion, sightings = _of_motion(state, config), _of_sightings(state, config)
     of_cameras = (s for camera in found.cameras for s in _of_camera(state, config, camera))
     return (*motion, *sightings, *of_cameras, *_clocks(state, config, found))
+
+
+def constants_found(found: InstallationFound, config: Config) -> Iterator[Setting]:
+    """Constants of odometries beside the wheels and of registered sensors, which no line of ``robot.yaml`` takes back.
+
+    Args:
+        found: what was found.
+        config: as the run used it.
+    """
+    state = InstallationState(found)
+    for row in (*odometry.INSTALLATION.found(config), *registry.found_rows(config)):
+        yield from state.setting(
+            row.name, row.at, row.at + row.gain * state.value(row.parameter), {row.parameter: row.gain}
+        )
 
 
 def _of_motion(state: InstallationState, config: Config) -> Iterator[Setting]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
+from fgloc.calibration.installation import constants_found
 from fgloc.config import Config, base_role
 from fgloc.diagnosis.pairs import MAD
 from fgloc.diagnosis.truth import truth_sentence
@@ -485,7 +486,10 @@ class Metrics(BaseModel):
 
 
 def _installation(result: RunData) -> dict[str, FoundSetting]:
-    settings = () if result.found is None else result.found.settings
+    found, config = result.found, result.config
+    settings = () if found is None else found.settings
+    if found is not None and config is not None:
+        settings = (*settings, *constants_found(found, config))
     return {
         s.name: FoundSetting(given=s.given, prior_sigma=s.prior_sigma, found=s.found, sigma=s.sigma) for s in settings
     }

@@ -9,6 +9,7 @@ from fgloc import se2
 from fgloc.config import GateConfig, OdometryTopic, config_of
 from fgloc.errors import RecordingError
 from fgloc.evaluation.judgements import judgements
+from fgloc.evaluation.metrics import compute_metrics
 from fgloc.frames import yaw_quaternion
 from fgloc.recording.reader import TopicInfo, select_roles
 from fgloc.runner import run
@@ -167,6 +168,9 @@ def test_two_sound_odometries_are_both_used(tmp_path):
     assert when == {}
     assert 0.7 < np.mean(steps) < 0.9  # all but the first 5 s
     assert result.installation[f"{NAME}.x_m"][1] < 0.021
+    scale = compute_metrics(result, result.config).installation[f"{NAME}.scale"]
+    assert (scale.given, scale.prior_sigma) == (1.0, pytest.approx(0.02))
+    assert (scale.found, scale.sigma) == result.installation[f"{NAME}.scale"]
     assert not [f for f in result.findings if NAME in f.text]
 
 
