@@ -468,6 +468,7 @@ class OnlineRun:
                 *note("run", self._notes),
                 *self.parts.sanity.watch.findings(),
                 *note("floor.uneven", diagnosis.mistakes, Severity.ERROR),
+                *note("motion.model", self.parts.localizer.motion.mistakes, Severity.ERROR),
                 *diagnosis.found,
                 *note("run", self.parts.sentences),
             ]

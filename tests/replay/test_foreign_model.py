@@ -9,8 +9,11 @@ from fgloc.ablation.failures import events_of
 from fgloc.config import load_config
 from fgloc.estimation.log import OVERRULED
 from fgloc.evaluation.metrics import compute_metrics
+from fgloc.live import Live
+from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.base import with_values
+from fgloc.types import RawEvent
 
 MODEL = Path(fgloc.__file__).parent / "sensors" / "learned" / "models" / "mrclam" / "all.safetensors"
 SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
@@ -28,6 +31,16 @@ def test_a_model_of_another_robot_is_named_and_left_out():
     assert metrics.nees_over_3 < 1.4  # with it 358
     reasons = [d.reason for d in result.decisions if d.kind == "learned"]
     assert reasons.count("contradicted") > 0.5 * len(reasons)
+    with (
+        open_recording(folder / "bag", foreign.recording) as recording,
+        Live(foreign, folder / "map.yaml", roles=recording.roles) as live,
+    ):
+        for event in recording.events():
+            live.push(event)
+            if isinstance(event, RawEvent):
+                live.wait()  # no image is dropped
+        live.wait()
+        assert live.status().findings[0].code == "motion.model"
 
 
 def dark(first_s, last_s, end_s):
