@@ -42,9 +42,6 @@ from fgloc.sensors.measurements import LandmarkMeasurement, points_of
 from fgloc.stats import chi2_bound
 from fgloc.types import Decision, Step
 
-# --- Rows of a measurement in steps.csv -------------------------------------------------------------------------------
-
-
 # --- The gate, joint compatibility, misread ids -----------------------------------------------------------------------
 
 

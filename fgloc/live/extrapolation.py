@@ -340,7 +340,7 @@ class Extrapolator:
 def _without_slip(budget: NoiseBudget, readings: MotionReadings, sources: MotionSources) -> NoiseBudget:
     """Noise budget without the wheels if they contradict the learned motion: a slip that began after the keyframe.
 
-    The test that flags slips (`MotionFaults`) sees whole steps only.
+    The test that flags slips (`MotionFaultMonitor`) sees whole steps only.
     """
     if readings.learned is None or not sources.learned_is_independent or "learned" in budget.rejected:
         return budget
