@@ -336,11 +336,15 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
         yield f"  base_frame: {seen.frames[0]}"
     else:
         yield "  # base_frame: base_link  # no usual name is in tf"
-    delays = {r: t.delay_s or 0.0 for t in seen.info.topics for r, topic in seen.info.roles.items() if topic == t.name}
-    if other := other_clocks(delays):  # a topic without stamps counts as 0
-        roles = ", ".join(other)
-        yield f"  received_stamps: [{roles}]  # their header stamps are of another clock"
-        missing.append(f"the header stamps of {roles} are of another clock: receive times are used, which jitter")
+    timing = {role: t for t in seen.info.topics for role, topic in seen.info.roles.items() if topic == t.name}
+    unstamped = {role for role, t in timing.items() if 2 * t.zero_stamps > t.count}
+    other = unstamped.union(other_clocks({role: t.delay_s or 0.0 for role, t in timing.items()}))  # without stamps: 0
+    if other:
+        roles = ", ".join(sorted(other))
+        yield f"  received_stamps: [{roles}]  # their header stamps are of another clock, or not set"
+        missing.append(
+            f"the header stamps of {roles} are of another clock, or not set: receive times are used, which jitter"
+        )
     if "truth" in seen.info.roles:
         yield ""
         yield "# The truth's frame: the map's (none), or another one (se2: fitted, for evaluation only)."

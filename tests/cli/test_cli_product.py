@@ -391,20 +391,24 @@ def test_what_enter_leaves_open_is_still_to_be_filled_in(tmp_path):
     assert (code, (tmp_path / "other.yaml").exists()) == (130, False)
 
 
-def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path):
-    """As of the Pioneer: an odometry that is stamped days before it is received, beside markers with true stamps."""
+@pytest.mark.parametrize("unset", [False, True])
+def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path, unset):
+    """As of the Pioneer: an odometry that is stamped days before it is received, beside markers with true stamps.
+
+    Or with stamps of 0, as of a driver that sets none.
+    """
     path, late = tmp_path / "run" / "bag", 14 * 86_400 * 10**9
     with BagWriter(path) as bag:
         for k in range(40):
             stamp = START_NS + k * 50_000_000
             bag.odometry("/odom", stamp - late, np.zeros(3), (0.0, 0.0), received_ns=stamp)
-            bag.range_bearing("/landmarks", stamp, [(0, 2.0, 0.0)])
+            bag.range_bearing("/landmarks", 0 if unset else stamp, [(0, 2.0, 0.0)], received_ns=stamp)
             bag.truth("/truth", stamp, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     file = tmp_path / "robot.yaml"
     code, out, err = fgloc("init", path, "--out", file)
     config = load_config(file)
     assert code == 0
-    assert config.recording.received_stamps == ("odometry",)
+    assert config.recording.received_stamps == (("odometry", "sightings") if unset else ("odometry",))
     assert re.search(r"^warning: .*\bodometry\b.* clock\b", err, re.MULTILINE)
     assert config.truth.align == "se2"  # no map beside the bag: a survey begins at the first pose
     assert f"next: fgloc map {path}" in out
