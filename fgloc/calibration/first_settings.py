@@ -209,7 +209,8 @@ def with_findings(text: str, findings: Sequence[Finding]) -> str:
     written: dict[str, list[str]] = {}
     for key, (why, value) in values.items():
         section, _, name = key.rpartition(".")
-        lines = [line for line, place in zip(lines, _places(lines), strict=True) if place != key]
+        places = _places(lines)
+        lines = [x for x, place in zip(lines, places, strict=True) if place != key and not place.startswith(f"{key}.")]
         comment = textwrap.wrap(why, 110, initial_indent="  # ", subsequent_indent="  # ")
         block = written.setdefault(section, [])
         block += [*(() if comment[0] in block else comment), f"  {name}: {value}"]

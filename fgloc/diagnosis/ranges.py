@@ -244,6 +244,12 @@ def check_ranges(found: Conventions, path: Path) -> Path:
     refuted = fit.misfit * _WORSE < fit.as_given and fit.misfit * _RIVAL < fit.rival
     if refuted and fit.turn.off(1.0, _TURN_OFF, 4.0) and "imu" not in _told(found):
         _turn(found, fit.turn)
+    elif refuted and fit.turn.value < 0.0 and not fit.turn.off(-1.0, _TURN_OFF):
+        text = (
+            "The anchors are a mirror image of where they stand: wheels and gyro agree on left and right, ranges do not"
+        )
+        mirrored = {number: (x, -y, z) for number, (x, y, z) in section.anchors.items()}
+        found.add("uwb.mirrored", text, {"uwb.anchors": mirrored}, fit.turn)
     elif found.opposite and not refuted:
         text = "The gyro turns in the opposite direction of wheels and ranges, which agree"
         found.add("imu.sign", text, {"gyro.scale": -found.config.gyro.scale}, fit.turn)
@@ -269,6 +275,7 @@ def _turn(found: Conventions, turn: Figure) -> None:
     why = "the distance of the wheels is wrong" if turn.value > 0.0 else ""
     if turn.value < 0.0:
         text = "By the ranges the robot turns the other way than by its wheels: left and right are exchanged"
+        text += " (or, if they are not, the anchors are a mirror image)"
         if abs(math.log(size)) > _TURN_OFF:
             text += f", and {much}: their distance is wrong, too"
         found.add("wheels.sign", text, lines, turn)

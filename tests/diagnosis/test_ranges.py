@@ -22,8 +22,11 @@ START_NS, STEP_NS, STEPS = 1_700_000_000_000_000_000, 50_000_000, 1200
 SPEED, NOISE_M = 0.4, 0.05
 
 
-def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False):
-    """A minute in a room: bag with an odometry that reports so much turn and way, and ranges; the map beside it."""
+def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False, mirrored=False):
+    """A minute in a room: bag with an odometry that reports so much turn and way, and ranges; the map beside it.
+
+    With a gyro, if the map is mirrored: else either may be.
+    """
     rng = np.random.default_rng(5)
     dt = STEP_NS * 1e-9
     pose, reported = np.array([1.0, 1.0, 0.2]), np.zeros(3)
@@ -33,6 +36,8 @@ def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False):
             omega = 0.0 if straight else 0.9 * math.sin(0.35 * k * dt) + 0.35
             v = 0.05 * SPEED if straight else SPEED
             bag.odometry("/odom", stamp, tuple(reported), (way * v, turn * omega))
+            if mirrored:
+                bag.imu("/imu", stamp, (0.0, 0.0, omega), (0.0, 0.0, 9.81))
             if k % 2 == 0:
                 number = 1 + k // 2 % 4
                 length = math.dist((*pose[:2], 0.0), PLACES[number])
@@ -41,7 +46,8 @@ def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False):
                 )
             pose = se2.compose(pose, se2.exp((v * dt, 0.0, omega * dt)))
             reported = se2.compose(reported, se2.exp((way * v * dt, 0.0, turn * omega * dt)))
-    plain = {i: Landmark(i, np.array(p), np.eye(3), 0.0) for i, p in PLACES.items()}
+    side = -1.0 if mirrored else 1.0
+    plain = {i: Landmark(i, np.array([x, side * y, z]), np.eye(3), 0.0) for i, (x, y, z) in PLACES.items()}
     write_map(LandmarkMap(plain, None), folder / "map.yaml")
     return folder / "bag"
 
@@ -98,6 +104,13 @@ def test_wheels_that_turn_otherwise_than_ranges_show_are_named_and_corrected(tmp
     codes, config = first(write(tmp_path, **wrong))
     assert code in codes
     assert config.wheels.scale_omega == pytest.approx(factor, rel=0.05)
+
+
+def test_a_mirrored_map_of_anchors_is_named_where_a_gyro_tells_left_from_right(tmp_path):
+    codes, config = first(write(tmp_path, mirrored=True))
+    assert codes == {"uwb.mirrored"}
+    assert config.uwb.anchors == PLACES
+    assert config.wheels.scale_omega == 1.0
 
 
 def test_ranges_that_are_too_long_are_named_and_corrected(tmp_path):
