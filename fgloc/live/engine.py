@@ -12,12 +12,12 @@ from enum import Enum
 from pathlib import Path
 
 from fgloc.assembly import Assembly
-from fgloc.config import Config, Role, TopicsConfig
+from fgloc.config import Config, Role, TopicsConfig, base_role
 from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.instrumentation import giving_way, one_blas_thread
 from fgloc.live.extrapolation import Outlet
-from fgloc.live.run import MOTION, LiveFacts, OnlineRun, role_name
+from fgloc.live.run import LOOK, MOTION, LiveFacts, OnlineRun, role_name
 from fgloc.live.state import Resumed, fingerprint, read_state, write_state
 from fgloc.sensors.markers.detector import Detector, use_one_thread
 from fgloc.sensors.markers.images import ImageError
@@ -68,12 +68,17 @@ class LiveStatus:
 
     @property
     def stale(self) -> str:
-        """Sentence on motion sources that have all fallen silent, so that the pose is not of now; empty: none has."""
-        motion = {topic: of for topic, of in self.topics.items() if of.role in MOTION}
-        missed = [of.silent_s for of in motion.values() if of.missed]
-        if not missed or min(of.silent_s for of in motion.values()) < min(missed):
+        """Sentence on sources that have all fallen silent, so that the pose is not of now; empty: they have not.
+
+        They are those of motion, or where there are none what sees landmarks.
+        """
+        sources = {topic: of for topic, of in self.topics.items() if of.role in MOTION} or {
+            topic: of for topic, of in self.topics.items() if base_role(of.role) in LOOK
+        }
+        missed = [of.silent_s for of in sources.values() if of.missed]
+        if not missed or min(of.silent_s for of in sources.values()) < min(missed):
             return ""
-        return f"STALE: no message of {', '.join(motion)} for {min(missed):.1f} s"
+        return f"STALE: no message of {', '.join(sources)} for {min(missed):.1f} s"
 
 
 # --- Marker detection: one worker, and a queue that drops the oldest waiting image ------------------------------------

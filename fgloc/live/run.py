@@ -74,8 +74,10 @@ def role_name(event: Event, topics: TopicsConfig) -> str:
 
 
 MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
+LOOK: tuple[Role, ...] = ("image", "sightings")
 _WITH_CAMERA: frozenset[Role] = frozenset({"image", "sightings"})
 _NOT_BUILT_FROM: frozenset[Role] = frozenset({"camera_info", "truth"})
+_FOR_MOTION = 5.0  # times the usual wait
 MOST_NAMES = 1000  # of frames and publishers that are kept: a robot has tens, and what invents names has no end
 _LONGEST_NAME = 255  # characters of a frame; ROS and tf2 set no bound
 
@@ -193,12 +195,16 @@ class LiveFacts:
         return tuple(missing)
 
     def complete(self, waited_s: float, patience_s: float) -> bool:
-        """Whether the run can be built: a motion source is there, and all that is expected, or the wait is over."""
-        if not set(MOTION) & set(self.roles):
+        """Whether the run can be built: all that is expected is there, or the wait is over.
+
+        What tells motion is waited for longer, unless none is expected: without it, sightings alone tell the pose.
+        """
+        moving = bool(set(MOTION) & set(self.roles))
+        if not moving and set(LOOK).isdisjoint(map(base_role, self.roles)):
             return False
         if self.expected is not None and self.expected <= set(self.roles):
             return True
-        return waited_s >= patience_s
+        return waited_s >= patience_s * (1.0 if moving else _FOR_MOTION)
 
     @property
     def topics(self) -> str:

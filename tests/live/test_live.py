@@ -31,8 +31,8 @@ from fgloc.sensors.base import with_values
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.detector import TrackingDetector
 from fgloc.sensors.markers.images import ImageEvent
-from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.types import Mode, RawEvent, TransformEvent, TruthEvent
+from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.types import Mode, RawEvent, SightingsEvent, TransformEvent, TruthEvent
 
 SAMPLES = Path(__file__).parent.parent.parent / "datasets" / "samples"
 WAITED_S = 0.3  # what a slow detector of these tests takes
@@ -490,3 +490,23 @@ def test_the_example_runs(tmp_path):
     done = subprocess.run([sys.executable, example, tmp_path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert [line for line in done.stdout.splitlines() if line.endswith(" OK")]
+
+
+@pytest.mark.parametrize("roles", [None, ("sightings",)])
+def test_sightings_alone_tell_the_pose_until_odometry_comes(roles):
+    world = World(beacons(), seconds=40.0)
+    late_ns = START_NS + 20_000_000_000
+    events = [
+        e
+        for e in world.events()
+        if isinstance(e, SightingsEvent) or (isinstance(e, OdometryEvent) and e.stamp_ns > late_ns)
+    ]
+    with Live(config(), beacons(), roles=roles) as live:
+        made = feed(live, [e for e in events if e.stamp_ns <= late_ns])
+        assert len(made) > 150
+        assert np.median(errors(world, made)) < 0.1
+        assert np.isfinite(live.pose_at().pose).all()
+        assert any("speed" in f.text for f in live.status().findings)
+        later = feed(live, [e for e in events if e.stamp_ns > late_ns])
+        assert "odometry" in {of.role for of in live.status().topics.values()}
+        assert np.median(errors(world, later[-50:])) < 0.05

@@ -9,7 +9,7 @@ from fgloc.cli.live import _exit_if_wrong
 from fgloc.cli.terminal import EXIT_LOST
 from fgloc.config import Config
 from fgloc.live import Live, live
-from fgloc.live.engine import LiveStatus
+from fgloc.live.engine import LiveStatus, TopicStatus
 from fgloc.live.wire.node import described
 from fgloc.types import ControlEvent, Mode
 
@@ -65,3 +65,11 @@ def test_a_run_that_ends_without_its_pose_says_so_in_the_exit_code(mode):
         assert ended.value.exit_code == EXIT_LOST
     else:
         _exit_if_wrong(node)
+
+
+@pytest.mark.parametrize(
+    ("others", "is_stale"), [({}, True), ({"/odom": TopicStatus("odometry", 99, 20.0, 0.0, 0.01, False)}, False)]
+)
+def test_where_nothing_tells_motion_silent_sightings_are_stale(others, is_stale):
+    topics = {"/landmarks": TopicStatus("sightings", 50, 5.0, 0.0, 2.0, True), **others}
+    assert LiveStatus(topics=topics).stale.startswith("STALE: no message of /landmarks") == is_stale

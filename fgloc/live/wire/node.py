@@ -18,7 +18,7 @@ from fgloc.errors import FglocError, WireError
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LivePose, LiveStatus
 from fgloc.live.process import EstimationProcess
-from fgloc.live.run import MOTION
+from fgloc.live.run import LOOK, MOTION
 from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, odom_in_map
 from fgloc.live.wire.transport import Clock, Publication, Received, Transport
 from fgloc.recording.reader import TF_TYPES, TopicInfo, events_of, select_roles, topic_key
@@ -28,7 +28,7 @@ from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Severity
 # --- Intake: topics found by type, selected by role, decoded as those of a recording ----------------------------------
 
 SETTLED_S = 1.0  # no new topic for this long: all of a robot's have been found
-LOOK: tuple[Role, ...] = ("image", "sightings")
+_FOR_MOTION_S = 10.0  # that a source of motion is waited for where there is what sees landmarks
 _TF, _TF_STATIC = "/tf", "/tf_static"
 
 
@@ -105,10 +105,11 @@ class Intake:
 
     def _missing(self, roles: Mapping[Role, str]) -> str:
         lacking = []
-        if not set(MOTION) & roles.keys():
-            lacking.append("odometry, joint states, commands or an IMU")
         every = (*MOTION, *LOOK, "camera_info", *self._config.topics.of_cameras)
         wanted = [role for role in every if base_role(role) in LOOK and self._config.topics.given(role) != "none"]
+        seen_long = set(wanted) & roles.keys() and time.monotonic() - self._changed_s > _FOR_MOTION_S
+        if not set(MOTION) & roles.keys() and not seen_long:
+            lacking.append("odometry, joint states, commands or an IMU")
         if wanted and not set(wanted) & roles.keys():
             lacking.append("images or marker sightings")
         names = {p.topic for p in self._found}
