@@ -440,9 +440,9 @@ class ProtectionMetrics(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    median_m: float  # of the bounds on the position
-    p95_m: float
-    median_yaw_deg: float
+    median_m: float | None  # of the bounds on the position; None: no pose has one
+    p95_m: float | None
+    median_yaw_deg: float | None
     alert_share: float  # of the poses whose bound is above the alert limit, or that have none
     causes: dict[str, float]  # shares of the poses, by what their bound is due to
     exceeded: float | None  # share of the poses that are wrong by more than their bound; None: no truth
@@ -632,13 +632,13 @@ def protection_metrics(result: RunData, matched: Matched | None) -> ProtectionMe
     position = np.array([p.position_m for p in result.protections])
     yaw, alert = (np.array(values) for values in zip(*((p.bound[2], p.alert) for p in result.protections), strict=True))
     finite = np.isfinite(position)
-    median, p95 = np.percentile(position[finite], [50, 95]).tolist() if finite.any() else (math.inf, math.inf)
+    median, p95 = np.percentile(position[finite], [50, 95]).tolist() if finite.any() else (None, None)
     causes = Counter(p.cause.split(" ")[0] if finite[i] else "no fix" for i, p in enumerate(result.protections))
     beyond = None if matched is None else beyond_bounds(result, matched)
     return ProtectionMetrics(
         median_m=median,
         p95_m=p95,
-        median_yaw_deg=math.degrees(float(np.median(yaw))),
+        median_yaw_deg=math.degrees(float(np.median(yaw[finite]))) if finite.any() else None,
         alert_share=float(alert.mean()),
         causes={cause: count / len(position) for cause, count in causes.most_common()},
         exceeded=None if beyond is None else float(beyond[0].mean()),

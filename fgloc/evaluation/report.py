@@ -221,13 +221,8 @@ def _protection_figures(metrics: Metrics) -> list[Row]:
     found = metrics.protection
     if found is None:
         return []
-    rows: list[Row] = [
-        (
-            "protection level",
-            f"{found.median_m:.3f} / {found.p95_m:.3f} m",
-            "bound on the position's error: median / 95 %",
-        )
-    ]
+    level = "none" if found.median_m is None else f"{found.median_m:.3f} / {found.p95_m:.3f} m"
+    rows: list[Row] = [("protection level", level, "bound on the position's error: median / 95 %")]
     if found.exceeded is not None:
         rows.append(("beyond the bound", f"{100.0 * found.exceeded:.2f} %", "poses wrong by more than was promised"))
     return rows

@@ -144,6 +144,18 @@ def test_bounds_on_the_error_are_written_and_held_against_the_truth(tmp_path):
     assert picture in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("bounded", [0, 40])
+def test_a_run_most_of_whose_poses_have_no_bound_is_written(tmp_path, bounded):
+    result = figure_eight()
+    bounds = [Protection(np.full(3, np.inf), np.inf, "no fix", alert=True) for _ in range(300)]
+    bounds[:bounded] = [Protection(np.array([0.5, 0.5, 0.1]), 0.6, "noise")] * bounded
+    report.write_results(replace(result, protections=tuple(bounds)), CONFIG, tmp_path, COMMAND, figures=())
+    found = json.loads((tmp_path / "metrics.json").read_text())["protection"]
+    figures = [found[name] for name in ("median_m", "p95_m", "median_yaw_deg")]
+    assert figures == (pytest.approx([0.6, 0.6, np.degrees(0.1)]) if bounded else [None] * 3)
+    assert found["causes"]["no fix"] == pytest.approx(1.0 - bounded / 300)
+
+
 def test_truth_of_another_time_counts_as_none(tmp_path):
     result = figure_eight()
     result = replace(result, truth=Trajectory(result.truth.stamps_ns + 10**12, result.truth.poses))
