@@ -150,11 +150,11 @@ _background = _Background()
 @contextmanager
 def giving_way(wait: Callable[[], None]) -> Iterator[None]:
     """Call ``wait`` at each `give_way` of this thread while the block runs: it returns when others have no work."""
-    _background.wait = wait
+    before, _background.wait = _background.wait, wait
     try:
         yield
     finally:
-        _background.wait = None
+        _background.wait = before
 
 
 def give_way() -> None:

@@ -49,10 +49,7 @@ def _t_bound(probability: float, samples: int) -> float:
 
 
 def few_samples(samples: int) -> float:
-    """Factor by which a standard deviation that few samples gave is too small for what is five of them away.
-
-    Source: Student 1908, The probable error of a mean.
-    """
+    """Factor on five standard deviations that so few samples gave, to be as sure as of many: Student's t over normal."""
     return math.sqrt(_t_bound(math.erf(5.0 / math.sqrt(2.0)), max(samples - 1, 1))) / 5.0
 
 

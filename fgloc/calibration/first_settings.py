@@ -209,12 +209,23 @@ def with_findings(text: str, findings: Sequence[Finding]) -> str:
     written: dict[str, list[str]] = {}
     for key, (why, value) in values.items():
         section, _, name = key.rpartition(".")
-        places = _places(lines)
-        lines = [x for x, place in zip(lines, places, strict=True) if place != key and not place.startswith(f"{key}.")]
+        lines = list(_without(lines, key))
         comment = textwrap.wrap(why, 110, initial_indent="  # ", subsequent_indent="  # ")
         block = written.setdefault(section, [])
         block += [*(() if comment[0] in block else comment), f"  {name}: {value}"]
     return _with_lines("\n".join(lines) + "\n", written)
+
+
+def _without(lines: Sequence[str], key: str) -> Iterator[str]:
+    """Lines but that of a dotted key and those below it, which are further in."""
+    inside: int | None = None  # indentation of the key
+    for line, place in zip(lines, _places(lines), strict=True):
+        indent = len(line) - len(line.lstrip())
+        if inside is not None and line.strip() and indent > inside:
+            continue
+        inside = indent if place == key else None
+        if inside is None:
+            yield line
 
 
 def _with_lines(text: str, blocks: Mapping[str, Sequence[str]]) -> str:

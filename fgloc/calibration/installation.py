@@ -145,7 +145,11 @@ def installation_found(
         belief.cov[:n, :n],
         installation.prior().cov[:n, :n],
         parts.cameras,
-        "image" if "image" in roles else "sightings" if "sightings" in roles or not parts.sensors else "",
+        "image"
+        if "image" in roles
+        else ""
+        if parts.sensors and not (parts.cameras or "sightings" in roles)
+        else "sightings",
         "joints" if source == "ticks" else source,
     )
     return replace(

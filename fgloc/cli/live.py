@@ -233,7 +233,7 @@ def _exit_if_wrong(node: Node) -> None:
         return
     status = node.live.status()
     wrong = [f.text for f in status.findings if f.severity is Severity.ERROR]
-    if status.mode is Mode.LOST:
+    if status.mode is Mode.LOST or (status.mode is None and status.keyframes):
         wrong.append("LOST: the pose is not known")
     if status.stale:
         wrong.append(status.stale)

@@ -213,7 +213,8 @@ def _refined(
     sigmas = np.full(len(x), np.inf)
     if (samples := len(np.unique(tracks))) >= _FEWEST_TRACKS:
         by_parts = _jackknifed(lambda use: solve(use, x, part.sigma)[0], blocks, _by_landmark(ids))
-        by_parts[1:4] *= few_samples(samples)  # a mounting is named by nothing but this; a scale by map and wheels
+        # a mounting is named by nothing but this: the errors of a track are alike, and of few tracks all may be
+        by_parts[1:4] *= few_samples(samples)
         sigmas = np.hypot(by_parts, by_priors)
     for k in (1, 4):  # the wheels' noise has more than one place where a yaw or a lag fits a little better
         sigmas[k] = _as_sure(x, k, float(sigmas[k]), part.gain)

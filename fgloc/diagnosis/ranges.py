@@ -244,9 +244,10 @@ def check_ranges(found: Conventions, path: Path) -> Path:
     refuted = fit.misfit * _WORSE < fit.as_given and fit.misfit * _RIVAL < fit.rival
     if refuted and fit.turn.off(1.0, _TURN_OFF, 4.0) and "imu" not in _told(found):
         _turn(found, fit.turn)
-    elif refuted and fit.turn.value < 0.0 and not fit.turn.off(-1.0, _TURN_OFF):
+    elif refuted and "imu" in _told(found) and fit.turn.off(1.0, _TURN_OFF, 4.0) and not fit.turn.off(-1.0, _TURN_OFF):
         text = (
-            "The anchors are a mirror image of where they stand: wheels and gyro agree on left and right, ranges do not"
+            "The anchors are a mirror image of where they stand: wheels and gyro agree on left and right, ranges do "
+            "not (or the odometry has its turns from a gyro that is mounted the wrong way up)"
         )
         mirrored = {number: (x, -y, z) for number, (x, y, z) in section.anchors.items()}
         found.add("uwb.mirrored", text, {"uwb.anchors": mirrored}, fit.turn)

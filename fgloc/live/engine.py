@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
 from pathlib import Path
 
 from fgloc.assembly import Assembly
@@ -168,6 +169,7 @@ class DetectionWorker:
         """End the thread; images that wait are left."""
         with self._changed:
             self._stopping = True
+            self._todo.clear()
             self._changed.notify_all()
         self._thread.join()
 
@@ -196,7 +198,7 @@ class DetectionWorker:
             except ImageError as error:
                 reason = error.reason
             except Exception as error:  # told by whoever feeds this thread
-                self.error = error
+                self.error, self._detecting = error, False
                 return self._wake()
             with self._changed:
                 self._detecting = False
@@ -215,7 +217,7 @@ _MEAN_OF = 20  # steps, in the mean of their time
 _SAVE_EVERY_S = 1.0
 _COMPARE_EVERY_S = 0.5  # or less often, where nothing new is to be compared
 _COMPARED_SHARE = 0.03  # of the time, that comparisons may compute: on a slow computer they come less often ...
-_WAY_S = 0.03  # that a comparison waits at a time for the steps, which come first
+_WAY_S, _LONGEST_S = 0.03, 10.0  # that a comparison waits at a time, and in all, for the steps, which come first
 _COMPARED_FREELY_S = 1.0  # ... beyond so much: what is wrong from the start is named as soon as it shows
 _UNFOUND = (State.WAITING, State.DETECTING)
 
@@ -468,7 +470,8 @@ class Estimation:
         facts.note(event)
         self._held.append(item)
         self._first_ns = event.received_ns if self._first_ns is None else self._first_ns
-        if facts.complete((event.received_ns - self._first_ns) * 1e-9, self._startup_s):
+        waited_s = (event.received_ns - self._first_ns) * 1e-9
+        if facts.complete(waited_s, self._startup_s, self.run.map is not None):
             self._build()
             while self._held:
                 self._admit(self._held.popleft())
@@ -539,11 +542,15 @@ class Estimation:
         with self._changed:
             return not self._changed.wait_for(lambda: self._closing or self._failed is not None, seconds)
 
-    def _wait_until_idle(self) -> None:
-        """Wait for a moment in which nothing is estimated or detected, but no longer than a step takes."""
-        if self._working or self._worker.detecting:
+    def _urgent(self) -> bool:
+        ending = self._closing or self._failed is not None
+        return not ending and (self._working or self._worker.detecting)
+
+    def _wait_until_idle(self, last_s: float) -> None:
+        """Wait for a moment in which nothing is estimated or detected, but not long, nor after a time ``last_s``."""
+        if self._urgent() and time.monotonic() < last_s:
             with self._changed:
-                self._changed.wait_for(lambda: not (self._working or self._worker.detecting), _WAY_S)
+                self._changed.wait_for(lambda: not self._urgent(), _WAY_S)
 
     def _compare_regularly(self) -> None:
         """Compare signals beside the estimation, which goes on meanwhile, also where this fails."""
@@ -554,7 +561,7 @@ class Estimation:
                 comparison = self.run.comparison()
             try:
                 if comparison is not None:
-                    with giving_way(self._wait_until_idle):
+                    with giving_way(partial(self._wait_until_idle, time.monotonic() + _LONGEST_S)):
                         comparison()
                     give_back_memory()
             except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -190,21 +191,26 @@ class LiveFacts:
                 missing.append(f"{role} ({self._topics[role]}): {self._missing(role)}")
             elif self.expected is not None and role in self.expected:
                 missing.append(f"{role}: no message yet")
-        if not set(MOTION) & set(self.roles):
+        if not set(MOTION) & set(self.roles) and (self.expected is None or set(MOTION) & self.expected):
             missing.append("a motion source: odometry, joints, command or imu")
         return tuple(missing)
 
-    def complete(self, waited_s: float, patience_s: float) -> bool:
+    def complete(self, waited_s: float, patience_s: float, mapped: bool) -> bool:
         """Whether the run can be built: all that is expected is there, or the wait is over.
 
-        What tells motion is waited for longer, unless none is expected: without it, sightings alone tell the pose.
+        What tells motion is waited for longer, unless none is expected: on a map, sightings alone tell the pose.
+
+        Args:
+            waited_s: since the first message.
+            patience_s: for what may come.
+            mapped: whether there is a map. Without one, motion that came later would begin another one.
         """
         moving = bool(set(MOTION) & set(self.roles))
         if not moving and set(LOOK).isdisjoint(map(base_role, self.roles)):
             return False
         if self.expected is not None and self.expected <= set(self.roles):
             return True
-        return waited_s >= patience_s * (1.0 if moving else _FOR_MOTION)
+        return waited_s >= patience_s * (1.0 if moving else _FOR_MOTION if mapped else math.inf)
 
     @property
     def topics(self) -> str:

@@ -22,11 +22,8 @@ START_NS, STEP_NS, STEPS = 1_700_000_000_000_000_000, 50_000_000, 1200
 SPEED, NOISE_M = 0.4, 0.05
 
 
-def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False, mirrored=False):
-    """A minute in a room: bag with an odometry that reports so much turn and way, and ranges; the map beside it.
-
-    With a gyro, if the map is mirrored: else either may be.
-    """
+def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False, mirrored=False, gyro=False):
+    """A minute in a room: bag with an odometry that reports so much turn and way, and ranges; the map beside it."""
     rng = np.random.default_rng(5)
     dt = STEP_NS * 1e-9
     pose, reported = np.array([1.0, 1.0, 0.2]), np.zeros(3)
@@ -36,7 +33,7 @@ def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False, mirr
             omega = 0.0 if straight else 0.9 * math.sin(0.35 * k * dt) + 0.35
             v = 0.05 * SPEED if straight else SPEED
             bag.odometry("/odom", stamp, tuple(reported), (way * v, turn * omega))
-            if mirrored:
+            if gyro:
                 bag.imu("/imu", stamp, (0.0, 0.0, omega), (0.0, 0.0, 9.81))
             if k % 2 == 0:
                 number = 1 + k // 2 % 4
@@ -107,7 +104,9 @@ def test_wheels_that_turn_otherwise_than_ranges_show_are_named_and_corrected(tmp
 
 
 def test_a_mirrored_map_of_anchors_is_named_where_a_gyro_tells_left_from_right(tmp_path):
-    codes, config = first(write(tmp_path, mirrored=True))
+    codes, _ = first(write(tmp_path / "without", mirrored=True))
+    assert codes == {"wheels.sign"}
+    codes, config = first(write(tmp_path / "with", mirrored=True, gyro=True))
     assert codes == {"uwb.mirrored"}
     assert config.uwb.anchors == PLACES
     assert config.wheels.scale_omega == 1.0

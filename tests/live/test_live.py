@@ -272,6 +272,37 @@ def test_of_images_that_wait_the_oldest_gives_way_to_a_new_one():
     assert (worker.queued, worker.dropped) == (3, 2)
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_worker_that_has_ended_keeps_no_comparison_waiting(fails):
+    changed, entered, going_on = threading.Condition(), threading.Event(), threading.Event()
+
+    class Slow:
+        def detect(self, event):
+            entered.set()
+            assert going_on.wait(PATIENCE_S)
+            if fails:
+                raise RuntimeError("of the detector")
+
+    worker = DetectionWorker(changed, 3, TopicsConfig())
+    worker.detector = Slow()
+    with changed:
+        for k in range(2):
+            worker.submit(Queued(RawEvent(k, k, "/image", "cam"), State.WAITING, True))
+    assert entered.wait(PATIENCE_S)
+    assert worker.detecting
+    going_on.set()
+    worker.stop()
+    assert not worker.detecting
+
+
+def test_without_a_map_motion_is_waited_for():
+    with Live(config(), None) as live:
+        made = feed(live, [e for e in World(beacons(), seconds=20.0).events() if isinstance(e, SightingsEvent)])
+        status = live.status()
+    assert not made
+    assert any("motion source" in what for what in status.waiting_for)
+
+
 def test_under_overload_the_oldest_waiting_image_is_dropped(monkeypatch):
     sample = SAMPLES / "first_run"
     settings = load_config(sample / "robot.yaml")

@@ -21,6 +21,7 @@ from fgloc import se2
 from fgloc.cli import app
 from fgloc.cli import live as commands
 from fgloc.cli.options import configured
+from fgloc.cli.terminal import EXIT_LOST
 from fgloc.config import Config, load_config
 from fgloc.errors import WireError
 from fgloc.frames import quaternion_yaw, yaw_quaternion
@@ -377,13 +378,15 @@ def test_two_commands_as_two_processes(tmp_path):
                 check=False,
             )
             assert wait_until(lambda: len(poses) >= 14), done.stdout
+        time.sleep(2.0)  # the inputs have stopped
         live.send_signal(signal.SIGINT)
         said, _ = live.communicate(timeout=PATIENCE_S)
     finally:
         live.kill()
     assert done.returncode == 0, done.stderr
     assert "messages published" in done.stdout
-    assert live.returncode == (3 if re.search("^last mode +STALE", said, re.MULTILINE) else 0), said
+    assert live.returncode == EXIT_LOST, said
+    assert re.search("^last mode +STALE", said, re.MULTILINE), said
     summary = dict(line.split(maxsplit=1) for line in said.splitlines() if line.startswith(("keyframes", "duration")))
     assert int(summary["keyframes"]) == pytest.approx(20, abs=6), said
     assert "Subscribed: /odom (odometry)." in said

@@ -40,6 +40,7 @@ class Intake:
         undecodable: messages that could not be decoded, by topic.
         received: messages by topic.
         truth: whether a truth is read; only those who look on need it.
+        mapped: whether there is a map, on which sightings alone tell the pose where nothing tells motion.
     """
 
     def __init__(
@@ -57,7 +58,8 @@ class Intake:
         self.roles: dict[Role, str] = {}
         self.undecodable: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
-        self.truth = True
+        self.truth, self.mapped = True, False
+        self._looked_s: float | None = None  # since when there is what sees landmarks
         self._counting = threading.Lock()
 
     def find(self) -> str:
@@ -107,8 +109,12 @@ class Intake:
         lacking = []
         every = (*MOTION, *LOOK, "camera_info", *self._config.topics.of_cameras)
         wanted = [role for role in every if base_role(role) in LOOK and self._config.topics.given(role) != "none"]
-        seen_long = set(wanted) & roles.keys() and time.monotonic() - self._changed_s > _FOR_MOTION_S
-        if not set(MOTION) & roles.keys() and not seen_long:
+        if not set(wanted) & roles.keys():
+            self._looked_s = None
+        elif self._looked_s is None:
+            self._looked_s = time.monotonic()
+        alone = self.mapped and self._looked_s is not None and time.monotonic() - self._looked_s > _FOR_MOTION_S
+        if not set(MOTION) & roles.keys() and not alone:
             lacking.append("odometry, joint states, commands or an IMU")
         if wanted and not set(wanted) & roles.keys():
             lacking.append("images or marker sightings")
@@ -275,7 +281,7 @@ class Node:
         """
         publishing: threading.Thread | None = None
         teller = Teller(tell)
-        self.intake.truth = self.watch is not None
+        self.intake.truth, self.intake.mapped = self.watch is not None, self._landmarks is not None
         next_diagnostics_s, was_stale = time.monotonic(), False
         try:
             while not stop.wait(_POLL_S):
