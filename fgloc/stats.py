@@ -49,7 +49,7 @@ def _t_bound(probability: float, samples: int) -> float:
 
 
 def few_samples(samples: int) -> float:
-    """Factor on five standard deviations that so few samples gave, to be as sure as of many: Student's t over normal."""
+    """Student's t that is as sure as five standard deviations of many samples, over five."""
     return math.sqrt(_t_bound(math.erf(5.0 / math.sqrt(2.0)), max(samples - 1, 1))) / 5.0
 
 
