@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -161,13 +159,6 @@ def give_way() -> None:
     """Let more urgent work go first, if this is the background of it; called every few milliseconds of long work."""
     if _background.wait is not None:
         _background.wait()
-
-
-def give_back_memory() -> None:
-    """Return freed memory to the system, where the C library can (glibc): after large arrays it keeps ten megabytes."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None:
-        trim(0)
 
 
 def one_blas_thread(work: Callable[_P, _R]) -> Callable[_P, _R]:

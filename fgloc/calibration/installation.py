@@ -145,11 +145,7 @@ def installation_found(
         belief.cov[:n, :n],
         installation.prior().cov[:n, :n],
         parts.cameras,
-        "image"
-        if "image" in roles
-        else ""
-        if parts.sensors and not (parts.cameras or "sightings" in roles)
-        else "sightings",
+        _seen_by(parts, roles),
         "joints" if source == "ticks" else source,
     )
     return replace(
@@ -157,6 +153,13 @@ def installation_found(
         settings=settings_found(found, parts.config),
         landmarks=None if landmark_map is None else map_found(landmark_map, installation, belief),
     )
+
+
+def _seen_by(parts: Assembly, roles: Container[str]) -> str:
+    """Role whose stamps the sightings have; "" where registered sensors alone see landmarks."""
+    if "image" in roles:
+        return "image"
+    return "sightings" if parts.cameras or "sightings" in roles or not parts.sensors else ""
 
 
 def settings_found(found: InstallationFound, config: Config) -> tuple[Setting, ...]:

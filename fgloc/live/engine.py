@@ -16,7 +16,7 @@ from fgloc.assembly import Assembly
 from fgloc.config import Config, Role, TopicsConfig, base_role
 from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
-from fgloc.instrumentation import give_back_memory, giving_way, one_blas_thread
+from fgloc.instrumentation import giving_way, one_blas_thread
 from fgloc.live.extrapolation import Outlet
 from fgloc.live.run import LOOK, MOTION, LiveFacts, OnlineRun, role_name
 from fgloc.live.state import Resumed, fingerprint, read_state, write_state
@@ -563,7 +563,6 @@ class Estimation:
                 if comparison is not None:
                     with giving_way(partial(self._wait_until_idle, time.monotonic() + _LONGEST_S)):
                         comparison()
-                    give_back_memory()
             except Exception as error:
                 with self._changed:
                     self._notes.setdefault(f"sensors are not compared any more: {unexpected(error, 'the comparison')}")

@@ -76,7 +76,6 @@ def role_name(event: Event, topics: TopicsConfig) -> str:
 
 MOTION: tuple[Role, ...] = ("odometry", "joints", "command", "imu")
 LOOK: tuple[Role, ...] = ("image", "sightings")
-_WITH_CAMERA: frozenset[Role] = frozenset({"image", "sightings"})
 _NOT_BUILT_FROM: frozenset[Role] = frozenset({"camera_info", "truth"})
 _FOR_MOTION = 5.0  # times the usual wait
 MOST_NAMES = 1000  # of frames and publishers that are kept: a robot has tens, and what invents names has no end
@@ -231,7 +230,7 @@ class LiveFacts:
         own = {self._topics.get(camera_role(camera, r)) for r in CAMERA_ROLES}
         seen = {kind: event for (kind, topic), event in self._firsts.items() if topic in own} if camera else self._seen
         in_pixels = base == "sightings" and any(e.in_pixels for e in seen.values() if isinstance(e, SightingsEvent))
-        if base not in _WITH_CAMERA or self.camera is not None or not (base == "image" or in_pixels):
+        if base not in LOOK or self.camera is not None or not (base == "image" or in_pixels):
             return ""
         if CameraInfoEvent not in seen and config.camera.file is None:
             return f"no CameraInfo yet, and no {'cameras.' + camera if camera else 'camera'}.file"

@@ -393,10 +393,7 @@ def test_what_enter_leaves_open_is_still_to_be_filled_in(tmp_path):
 
 @pytest.mark.parametrize("unset", [False, True])
 def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path, unset):
-    """As of the Pioneer: an odometry that is stamped days before it is received, beside markers with true stamps.
-
-    Or with stamps of 0, as of a driver that sets none.
-    """
+    """An odometry that is stamped days before it is received, as the Pioneer's, and markers whose driver sets none."""
     path, late = tmp_path / "run" / "bag", 14 * 86_400 * 10**9
     with BagWriter(path) as bag:
         for k in range(40):

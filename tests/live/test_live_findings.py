@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import typer
-from live_feed import ROLES, feed
+from live_feed import ROLES, exit_code, feed
 from robot_world import SIGMA_BEARING, SIGMA_RANGE, START_NS, World, beacons, config, polar
 
 from fgloc import se2
-from fgloc.cli.live import _exit_if_wrong
 from fgloc.cli.terminal import EXIT_LOST
 from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.estimation.localizer import Localizer
@@ -150,13 +147,7 @@ def test_an_error_is_in_the_level_of_the_diagnostics_and_in_the_exit_code(severi
     status = LiveStatus(mode=Mode.OK, findings=(Finding("sightings.mirrored", "It is mirrored.", severity),))
     _, values = described(status)
     assert any("sightings.mirrored" in key for key in values) == (severity is not Severity.NOTE)
-    node = SimpleNamespace(live=SimpleNamespace(status=lambda: status))
-    if severity is Severity.ERROR:
-        with pytest.raises(typer.Exit) as ended:
-            _exit_if_wrong(node)
-        assert ended.value.exit_code == EXIT_LOST
-    else:
-        _exit_if_wrong(node)
+    assert exit_code(status) == (EXIT_LOST if severity is Severity.ERROR else 0)
     wrong = severity is Severity.ERROR
     levels = [diagnostics(0, Mode.OK, "", {}, w)["status"][0]["level"] for w in (False, wrong)]
     assert (levels[0] != levels[1]) == wrong

@@ -1,11 +1,8 @@
 """A live run whose inputs have stopped says so, and since when."""
 
-from types import SimpleNamespace
-
 import pytest
-import typer
+from live_feed import exit_code
 
-from fgloc.cli.live import _exit_if_wrong
 from fgloc.cli.terminal import EXIT_LOST
 from fgloc.config import Config
 from fgloc.live import Live, live
@@ -40,13 +37,11 @@ def test_silence_of_all_motion_is_stale_within_a_second(clock):
         assert described(status)[0] == status.stale
         (topic,) = status.topics.values()
         assert topic.missed
-        with pytest.raises(typer.Exit) as ended:
-            _exit_if_wrong(SimpleNamespace(live=run))
-        assert ended.value.exit_code == EXIT_LOST
+        assert exit_code(status) == EXIT_LOST
         assert topic.silent_s == pytest.approx(0.95, abs=0.06)
         drive(run, clock, 0.5)
         assert not run.status().stale
-        _exit_if_wrong(SimpleNamespace(live=run))
+        assert exit_code(run.status()) == 0
 
 
 def test_a_slow_topic_is_not_missed_between_two_messages(clock):
@@ -58,13 +53,7 @@ def test_a_slow_topic_is_not_missed_between_two_messages(clock):
 
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_run_that_ends_without_its_pose_says_so_in_the_exit_code(mode):
-    node = SimpleNamespace(live=SimpleNamespace(status=lambda: LiveStatus(mode=mode)))
-    if mode is Mode.LOST:
-        with pytest.raises(typer.Exit) as ended:
-            _exit_if_wrong(node)
-        assert ended.value.exit_code == EXIT_LOST
-    else:
-        _exit_if_wrong(node)
+    assert exit_code(LiveStatus(mode=mode)) == (EXIT_LOST if mode is Mode.LOST else 0)
 
 
 @pytest.mark.parametrize(

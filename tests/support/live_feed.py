@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from types import SimpleNamespace
 
 import numpy as np
+import typer
 from robot_world import CAMERA, World, config, position_error
 
+from fgloc.cli.live import _exit_if_wrong
 from fgloc.live import Live
+from fgloc.live.engine import LiveStatus
 from fgloc.types import Estimate, Event
 
 ROLES = ("odometry", "command", "sightings")
@@ -29,6 +33,15 @@ def feed(live: Live, events: Iterable[Event]) -> list[Estimate]:
         live.push(event)
     assert live.wait(PATIENCE_S)
     return made
+
+
+def exit_code(status: LiveStatus) -> int:
+    """Exit code of `fgloc live` for a run that ends with this status."""
+    try:
+        _exit_if_wrong(SimpleNamespace(live=SimpleNamespace(status=lambda: status)))
+    except typer.Exit as ended:
+        return ended.exit_code
+    return 0
 
 
 def errors(world: World, estimates: Iterable[Estimate]) -> np.ndarray:
