@@ -382,7 +382,12 @@ def role_names() -> tuple[Role, ...]:
     return tuple(dict.fromkeys((*BUILT_IN_ROLES, *outside)))  # one may read a built-in role from a message of its own
 
 
-def _known_role(role: str) -> str:
+def known_role(role: str) -> str:
+    """A role that there is.
+
+    Raises:
+        ValueError: it is none; the message has those that are.
+    """
     if role not in role_names() and not role.startswith(BESIDE) and base_role(role) not in CAMERA_ROLES:
         names = ", ".join(role_names())
         raise ValueError(f"expected one of {names}, {BESIDE}NAME of recording.odometries, or a camera's: front/image")
@@ -395,7 +400,7 @@ def _known_source(name: str) -> str:
     return name
 
 
-_KnownRole = Annotated[str, AfterValidator(_known_role)]
+_KnownRole = Annotated[str, AfterValidator(known_role)]
 
 
 class TopicsConfig(Section):

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Unpack
+from typing import Unpack, get_args
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import contradiction_findings, contradictions, found_values, installation_found
 from fgloc.config import Config, Role, base_role, base_roles
 from fgloc.diagnosis.mistakes import Mistakes, find_mistakes, unused_sightings
-from fgloc.errors import EstimatorError
+from fgloc.errors import ConfigError, EstimatorError
 from fgloc.evaluation.report import write_results
 from fgloc.graph.contradictions import Contradiction
 from fgloc.instrumentation import one_blas_thread, working
@@ -156,8 +156,10 @@ def run(
         options: as `RunOptions` has them.
 
     Raises:
-        FglocError: the input cannot be used, or no pose was ever found.
+        FglocError: the input or the mode cannot be used, or no pose was ever found.
     """
+    if mode not in get_args(RunMode):
+        raise ConfigError(f"mode {mode!r}: expected one of {', '.join(get_args(RunMode))}")
     began = time.perf_counter()
     check = options.get("check", True) and options.get("events") is None and options.get("sightings") is None
     with working("checking"):

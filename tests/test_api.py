@@ -13,6 +13,7 @@ from run_results import START_NS, figure_eight
 from source_roots import PYTHONPATH
 
 import fgloc
+from fgloc.config import Config
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE = ROOT / "datasets" / "samples" / "first_run"
@@ -69,6 +70,13 @@ def test_all_errors_are_public():
     assert known <= set(fgloc.__all__)
 
 
+def test_a_mode_and_a_role_that_there_are_not_are_refused():
+    with pytest.raises(fgloc.ConfigError, match=r"'bach'.*batch, online"):
+        fgloc.run(Path("no bag"), None, Config(), "bach")
+    with pytest.raises(fgloc.ConfigError, match=r"'rangs'.*odometry"):
+        fgloc.Live(Config(), None, roles=("odometry", "rangs"))
+
+
 def test_interpolate_takes_the_shorter_way_round():
     trajectory = fgloc.Trajectory(np.array([0, 10, 20]), np.array([[0.0, 0.0, 3.0], [1.0, 2.0, -3.0], [1.0, 2.0, 0.0]]))
     pose = trajectory.interpolate(5)
@@ -94,6 +102,7 @@ def test_write_makes_the_folder_of_a_run(tmp_path):
     assert {"trajectory.tum", "covariance.csv", "steps.csv", "metrics.json", "report.html"} <= names
     first = (tmp_path / "out" / "trajectory.tum").read_text(encoding="utf-8").splitlines()[1]
     assert first.startswith(f"{START_NS // 10**9}.")
+    assert len(fgloc.read_results(str(tmp_path / "out")).trajectory) == len(result.trajectory)
 
 
 def run_example(*arguments):

@@ -206,7 +206,7 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
         if finding.severity == "note":
             say_remark(finding.severity, finding.text)
     say_table(None, rows)
-    exit_unless_trusted(result)
+    exit_unless_trusted(result, metrics)
 
 
 def _demo_row(mode: str, metrics: Metrics) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from typer.core import TyperCommand
 from fgloc.instrumentation import Advance, end, tell, told_to
 
 if TYPE_CHECKING:
+    from fgloc.evaluation.metrics import Metrics
     from fgloc.replay import Progress
     from fgloc.runner import RunResult
     from fgloc.sensors.base import Asked, Question
@@ -49,23 +50,28 @@ def typed() -> str:
     return shlex.join(["fgloc", *sys.argv[1:]])
 
 
-def exit_code(result: RunResult) -> int:
-    """0, or 3 if a part of the run is not to be trusted, or its set-up is wrong."""
+def exit_code(result: RunResult, metrics: Metrics | None = None) -> int:
+    """0, or 3 if a part of the run is not to be trusted, or its set-up is wrong, also by its figures."""
     from fgloc.types import Mode
 
-    return EXIT_LOST if Mode.LOST in result.modes or result.mistakes else 0
+    return EXIT_LOST if Mode.LOST in result.modes or _is_wrong(result, metrics) else 0
 
 
-def exit_unless_trusted(result: RunResult) -> None:
-    """End with code 3 if a part of the run is not to be trusted, or its set-up is wrong."""
+def _is_wrong(result: RunResult, metrics: Metrics | None) -> bool:
+    by_figures = metrics is not None and any(finding.severity == "error" for finding in metrics.findings)
+    return bool(result.mistakes) or by_figures
+
+
+def exit_unless_trusted(result: RunResult, metrics: Metrics | None = None) -> None:
+    """End with code 3 if a part of the run is not to be trusted, or its set-up is wrong, also by its figures."""
     from fgloc.types import Mode
 
     lost = sum(mode is Mode.LOST for mode in result.modes)
     if lost:
         say(f"LOST for {lost} of {len(result.modes)} poses: do not trust them", err=True)
-    if result.mistakes:
+    if _is_wrong(result, metrics):
         say("not to be trusted, for the reason that is named first", err=True)
-    if code := exit_code(result):
+    if code := exit_code(result, metrics):
         raise typer.Exit(code)
 
 

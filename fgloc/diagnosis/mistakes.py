@@ -97,7 +97,10 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
         now, landmark_map = now.with_camera(name, found.config), found.landmark_map
     undone = now != config or landmark_map is not None
     if undone and any(finding.severity is Severity.ERROR for finding in findings):
-        findings += note("setup.corrected", ["This run was made as if the lines above were set: set them."])
+        said = "This run was made as if the lines above were set: set them."
+        if any(finding.code in ("wheels.scale", "wheels.turn") and not finding.lines for finding in findings):
+            said += " What the truth alone says of the wheels is not applied."
+        findings += note("setup.corrected", [said])
     return Mistakes(tuple(findings), now, landmark_map, undone, checked=True)
 
 

@@ -231,7 +231,8 @@ def all_findings(
         frame: that the truth is in another frame or has other axes, which makes errors of what are none.
     """
     known = {finding.code for finding in result.findings}
-    judged = _optimistic(result, nees_over_3) if frame is None else [frame]
+    gross = size is not None and size.gross
+    judged = [frame] if frame is not None else [] if gross else _optimistic(result, nees_over_3)
     misjudged = [finding for finding in judged if finding.code not in known]
     return ordered([*result.findings, *_sized(size), *misjudged, *_dropped(result, rejections, keyframes)])
 
@@ -292,6 +293,11 @@ class Size:
         return abs(self.scale - 1.0) >= _SIZE_OFF and self.scaled_m < _SIZE_EXPLAINS * self.rigid_m
 
     @property
+    def gross(self) -> bool:
+        """Whether so large a scale is no installation's error: a unit or a geometry is wrong."""
+        return self.told and abs(math.log(self.scale)) > math.log(_SIZE_GROSS)
+
+    @property
     def sentence(self) -> str:
         """The scale, and where it may come from."""
         return (
@@ -302,6 +308,7 @@ class Size:
 
 
 _SIZE_OFF = 0.01  # share; smaller scales are lost in other errors
+_SIZE_GROSS = 2.0  # times, or one part of
 _SIZE_EXPLAINS = 0.5  # largest share of the error that is left
 
 
@@ -319,7 +326,8 @@ def size_of(matched: Matched) -> Size | None:
 
 def _sized(size: Size | None) -> Iterator[Finding]:
     if size is not None and size.told:
-        yield Finding("truth.size", size.sentence, Severity.WARNING, value=size.scale)
+        severity = Severity.ERROR if size.gross else Severity.WARNING
+        yield Finding("truth.size", size.sentence, severity, value=size.scale)
 
 
 def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:

@@ -51,13 +51,14 @@ class Results:
     truth: Trajectory | None = None
 
 
-def read_results(folder: Path) -> Results:
+def read_results(folder: Path | str) -> Results:
     """Read the folder of a run, also of an older version: what it did not write is missing.
 
     Raises:
         TrajectoryError: a file is missing, or a line of it is not what a run writes; the message names both.
         MapError: its map cannot be read.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise TrajectoryError(f"{folder}: no such folder; {_REMEDY}")
     if not (folder / "trajectory.tum").is_file():

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fgloc.config import Config, Role
-from fgloc.errors import EstimatorError, FglocError
+from fgloc.config import Config, Role, known_role
+from fgloc.errors import ConfigError, EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.intake.clocks import Source, TopicClocks, source_of
 from fgloc.intake.validation import EventValidator, reported_bounds
@@ -215,8 +215,14 @@ class Live(registry.SensorInput):
                 and the caller's own threads never wait for an update. It costs some processor time for every event.
 
         Raises:
+            ConfigError: a role that there is not.
             MapError, ModelError: as their loaders have it.
         """
+        for role in roles or ():
+            try:
+                known_role(role)
+            except ValueError as error:
+                raise ConfigError(f"roles: {role!r}: {error}") from None
         if isinstance(landmark_map, Path):
             landmark_map = configured_map(landmark_map, config)
         learned_motion(config, None)  # refuses a file now, not when the robot drives

@@ -13,6 +13,7 @@ import pytest
 from browser import Browser
 from run_results import figure_eight
 
+from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config
 from fgloc.errors import OutputError
 from fgloc.evaluation import report
@@ -120,6 +121,20 @@ def test_a_wrong_size_and_a_wrong_covariance_are_named_and_coloured(tmp_path, fa
     if factor != 1.0:
         assert found["truth.size"].value == pytest.approx(factor, abs=0.005)
         assert f" {found['truth.size'].value:.4g} times " in found["truth.size"].text
+
+
+@pytest.mark.parametrize("factor", [30.0, 0.02])
+def test_a_size_that_is_grossly_wrong_is_an_error_and_blames_no_covariance(factor):
+    """Ticks taken for radians, a radius in centimetres: no sigma of an installation explains that."""
+    result = figure_eight()
+    poses = result.trajectory.poses * [factor, factor, 1.0]
+    changed = replace(result, trajectory=replace(result.trajectory, poses=poses))
+    metrics = compute_metrics(changed, CONFIG)
+    found = {f.code: f.severity for f in metrics.findings}
+    assert found["truth.size"] == "error"
+    assert "covariance.optimistic" not in found
+    assert exit_code(changed, metrics) == EXIT_LOST
+    assert exit_code(result, compute_metrics(result, CONFIG)) == 0
 
 
 def test_bounds_on_the_error_are_written_and_held_against_the_truth(tmp_path):
