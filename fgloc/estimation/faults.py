@@ -341,6 +341,7 @@ _SHAKES_M_S, _SHAKES_RAD_S = 0.02, 0.05  # m/s, rad/s
 _ONSET_S = 0.5  # from the start of a lift to its alarm
 _APART_S = 5.0  # between two signs of one handling: nobody sets a robot down for less
 _SETTLED_S = 2.0  # after the last sign: a sighting then ends it
+_SPARSE_S = 0.25  # a sample of the IMU stands for no longer
 
 
 class LiftMonitor:
@@ -466,6 +467,9 @@ class _RiseTest:
             self.skip(step)
             return 0.0, math.inf
         each, self._newest_ns = step.dt / len(new), new[-1].stamp_ns
+        if each > _SPARSE_S:  # one sample does not tell what a silence held
+            self.skip(step)
+            return 0.0, math.inf
         for force in forces:
             self._samples.append((each, force))
             self._length_s += each
@@ -506,7 +510,8 @@ class _TiltTest:
         new, before = [(*e.angular_velocity, *e.linear_acceleration) for e in events], self._newest
         self._newest = new[-1] if new else before
         frozen = all(sample == before for sample in new)  # or there is none
-        if self._up is None or readings.wheels is None or frozen or not np.isfinite(new).all():
+        sparse = step.dt > _SPARSE_S * len(new)
+        if self._up is None or readings.wheels is None or frozen or sparse or not np.isfinite(new).all():
             self._steps.clear()
             return 0.0, bound
         scale = float(np.linalg.norm(self._up))

@@ -346,14 +346,17 @@ def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
 def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> Iterator[Finding]:
     dropped: Counter[str] = Counter()
     for reason, count in rejections.items():
-        dropped[reason.partition(".")[0]] += count
+        if not reason.endswith(".frozen"):  # has its own warning
+            dropped[reason.partition(".")[0]] += count
     most = max((topic.count for topic in result.spans.values()), default=0)
     for sensor, count in dropped.most_common():
         if (kind := base_role(sensor)) not in _SETTINGS:
             continue
         received = keyframes if kind in ("image", "sightings") else most
         if count >= _FEWEST and count > _MOST_DROPPED * max(received, count):
-            reasons = ", ".join(f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}."))
+            reasons = ", ".join(
+                f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}.") and not r.endswith(".frozen")
+            )
             too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
             unit, settings = "", _SETTINGS[kind]
             if 2 * too_fast > count:

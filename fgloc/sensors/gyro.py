@@ -38,7 +38,7 @@ from fgloc.sensors.checks import Changes, FieldChecks, Table, count, finite_rows
 from fgloc.sensors.failures import Carriage, Change, EventFailure, Scene
 from fgloc.sensors.wheels.motion import Standing
 from fgloc.stats import GATE, chi2_bound
-from fgloc.types import Event, FloatArray, InertialEvent, InertialReading, Setting, Step
+from fgloc.types import Event, FloatArray, Grave, InertialEvent, InertialReading, Setting, Step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,14 +60,33 @@ def from_imu(m: Any, when: When) -> Event:
 
 
 _MAX_ACCELERATION = 1e3  # m/s²
+_FROZEN_NS, _FROZEN_TIMES = 1_000_000_000, 10  # for so long, and so often: noise does not repeat six values
+_LEAST_RATE = 1e-6  # rad/s: a simulated IMU without noise repeats itself while its robot stands
 
 
 def imu_validator(checks: FieldChecks) -> Callable[[ImuEvent], Event | str]:
     """Validator of IMU messages."""
     bounds = checks.config
+    repeated: dict[str, tuple[tuple[float, ...], int, int]] = {}  # by topic: values, since when, how often
+
+    def is_frozen(event: ImuEvent) -> bool:
+        values = (*event.angular_velocity.tolist(), *event.linear_acceleration.tolist())
+        before, since_ns, times = repeated.get(event.topic, ((), 0, 0))
+        same = values == before and event.stamp_ns > since_ns
+        repeated[event.topic] = (before, since_ns, times + 1) if same else (values, event.stamp_ns, 1)
+        lasts = same and event.stamp_ns - since_ns > _FROZEN_NS and times >= _FROZEN_TIMES
+        return lasts and any(values[3:]) and max(map(abs, values[:3])) > _LEAST_RATE
 
     def validate(event: ImuEvent) -> Event | str:
         changes: Changes = {}
+        if is_frozen(event):
+            checks.note(
+                Grave(
+                    f"{event.topic}: rates and accelerations repeat to the digit for more than "
+                    f"{_FROZEN_NS * 1e-9:g} s: the IMU is frozen, and such messages are rejected (see its driver)"
+                )
+            )
+            return "frozen"
         cov = event.angular_velocity_cov
         if cov[0, 0] == -1.0:  # REP 145
             checks.note(f"{event.topic}: says that it has no gyroscope (its covariance starts with -1)")

@@ -1,6 +1,7 @@
 """What the gate lets through, repairs and rejects, beyond the rows of faults (test_faults_gate.py)."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from event_makers import (
 
 from fgloc.config import GateConfig
 from fgloc.intake.validation import EventValidator
-from fgloc.types import CameraInfoEvent, TransformEvent, TruthEvent
+from fgloc.types import CameraInfoEvent, Grave, TransformEvent, TruthEvent
 
 
 @pytest.fixture
@@ -206,3 +207,20 @@ def test_commands_are_bounded_in_both_directions(gate, sign):
 def test_yaw_rates_of_odometry_are_bounded_in_both_directions(gate):
     gate.check(odometry(1.0, twist=(0.0, -1.01 * GateConfig().max_yaw_rate)))
     assert gate.rejections == {"odometry.twist_yaw_rate_bound": 1}
+
+
+def frozen_imu(rate, acceleration=9.81):
+    return [replace(imu(1.0 + 0.05 * k, rate), linear_acceleration=np.array([0, 0, acceleration])) for k in range(60)]
+
+
+def test_an_imu_that_repeats_itself_is_frozen_until_it_measures_again(gate):
+    passed = [gate.check(event) for event in frozen_imu(0.2)]
+    assert [event is not None for event in passed] == [k <= 20 for k in range(60)]  # of the first second
+    assert gate.rejections == {"imu.frozen": 39}
+    assert any(isinstance(note, Grave) for note in gate.notes)
+    assert gate.check(imu(5.0, 0.21)) is not None
+
+
+@pytest.mark.parametrize(("rate", "acceleration"), [(0.0, 9.81), (0.2, 0.0)])
+def test_an_imu_without_noise_at_rest_or_without_accelerometer_may_repeat_itself(gate, rate, acceleration):
+    assert all(gate.check(event) is not None for event in frozen_imu(rate, acceleration))

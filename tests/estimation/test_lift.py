@@ -171,3 +171,15 @@ def test_a_robot_that_stands_and_tilts_is_in_somebodys_hands(forward, told):
     assert not any(alarms(monitor, [(s, readings(s, forward)) for s in level]))
     found = alarms(monitor, [(s, readings(s, forward)) for s in tilts])
     assert any("tilted_at_rest" in reasons for reasons in found) == told
+
+
+def test_one_sample_after_a_silence_is_no_lift():
+    """What the IMU measured within a second is in no single message."""
+    rng, monitor = np.random.default_rng(7), LiftMonitor(10.0, np.array([0.0, 0.0, 1.0]))
+    calm = [step(k, 9.78 + rng.normal(0.0, 0.1, 20)) for k in range(100)]
+    assert not any(alarms(monitor, [(s, readings(s)) for s in calm]))
+    last = step(103, 10.9)
+    one = replace(last.inertial[-1], angular_velocity=np.array([0.5, 0.0, 0.0]))
+    sparse = replace(last, start_ns=calm[-1].stamp_ns, motion=by_class([one]))
+    assert alarms(monitor, [(sparse, readings(sparse))]) == [[]]
+    assert not monitor.carried

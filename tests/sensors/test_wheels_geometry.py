@@ -1,8 +1,12 @@
-"""Which joints are wheels, by their names."""
+"""Which joints are wheels, by their names, and their radius and track, by an odometry."""
 
+import math
+
+import numpy as np
 import pytest
+from event_makers import joints, odometry
 
-from fgloc.sensors.wheels.sensor import WheelPair, wheel_pair
+from fgloc.sensors.wheels.sensor import WheelPair, fit_geometry, wheel_pair
 
 
 @pytest.mark.parametrize(
@@ -30,3 +34,29 @@ def test_the_pair_is_found_by_name(names, left, right):
 )
 def test_what_is_not_clear_is_left_to_the_user(names):
     assert wheel_pair(names) is None
+
+
+RADIUS, TRACK = 0.033, 0.16
+
+
+def driven(by_pose):
+    """Joints and odometry of a robot that speeds up and turns; only its pose, or only its twist, is the wheels'."""
+    dt, yaw, place, turned = 0.05, 0.0, np.zeros(2), np.zeros(2)
+    joint_events, odometry_events = [], []
+    for k in range(400):
+        v, omega = 0.1 + 0.1 * math.sin(0.3 * k * dt), 0.5 * math.sin(0.5 * k * dt)
+        rates = (v + np.array([-0.5, 0.5]) * TRACK * omega) / RADIUS
+        joint_events.append(joints(1.0 + k * dt, *turned, names=("left_wheel", "right_wheel")))
+        pose, twist = ((*place, yaw), (0.95 * v, 1.05 * omega)) if by_pose else ((0.0, 0.0, 0.0), (v, omega))
+        odometry_events.append(odometry(1.0 + k * dt, pose, twist))
+        heading = yaw + 0.5 * omega * dt
+        place = place + v * dt * np.array([math.cos(heading), math.sin(heading)])
+        yaw, turned = yaw + omega * dt, turned + rates * dt
+    return joint_events, odometry_events
+
+
+@pytest.mark.parametrize("by_pose", [True, False])
+def test_radius_and_track_are_those_that_the_driver_sums_its_pose_up_with(by_pose):
+    found = fit_geometry(WheelPair("left_wheel", "right_wheel"), *driven(by_pose))
+    assert found.radius_m == pytest.approx(RADIUS, rel=0.005)
+    assert found.track_m == pytest.approx(TRACK, rel=0.01)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from fgloc.config import Config
 from fgloc.errors import ConfigError
+from fgloc.frames import quaternion_yaw
 from fgloc.sensors.base import (
     Asked,
     BuiltIn,
@@ -146,7 +147,7 @@ def fit_geometry(
     odometry: Sequence[OdometryEvent],
     commands: Sequence[ControlEvent] = (),
 ) -> WheelGeometry | None:
-    """Radius and track with which the wheels' angles give the driver's speeds; None if they do not explain them.
+    """Radius and track with which the wheels' angles give the driver's motion; None if they do not explain it.
 
     The odometry gives the radius, and the track unless its turn is another sensor's; then the commands give it.
 
@@ -161,32 +162,53 @@ def fit_geometry(
     keep = np.flatnonzero(np.diff(stamps, prepend=-1) > 0)
     if len(keep) < _FEWEST or len(odometry) < _FEWEST or not np.isfinite(angles[keep]).all():
         return None
-    seconds, angles = (stamps[keep] - stamps[keep[0]]) * 1e-9, angles[keep]
-    at = np.array([(event.stamp_ns - stamps[keep[0]]) * 1e-9 for event in odometry])
-    twists = np.array([[event.linear[0], event.angular[2]] for event in odometry])
-    at, twists = at[known := np.isfinite(twists).all(axis=1)], twists[known]  # the gate refuses some
-    if len(at) < _FEWEST:
-        return None
-    order = np.argsort(at, kind="stable")
-    told = np.stack([np.interp(seconds, at[order], twists[order, k]) for k in range(2)], axis=1)
-    gone = np.cumsum(0.5 * (told[1:] + told[:-1]) * np.diff(seconds)[:, None], axis=0)
-    gone = np.concatenate([np.zeros((1, 2)), gone])
+    origin_ns = int(stamps[keep[0]])
+    seconds, angles = (stamps[keep] - origin_ns) * 1e-9, angles[keep]
     later = np.minimum(np.searchsorted(seconds, seconds + _WINDOW_S), len(seconds) - 1)
     lasted = seconds[later] - seconds
-    heard = np.searchsorted(at[order], seconds[later], side="right") - np.searchsorted(at[order], seconds)
-    whole = (lasted > 0.5 * _WINDOW_S) & (lasted < 2.0 * _WINDOW_S) & (heard > 1)  # no silence in it
-    if whole.sum() < _FEWEST:
-        return None
-    rates, means = (((x[later] - x)[whole] / lasted[whole, None]) for x in (angles, gone))
-    difference, seconds = rates[:, 1] - rates[:, 0], seconds[whole]
-    radius = _slope(rates.mean(axis=1), means[:, 0])
-    per_difference = _slope(difference, means[:, 1]) if told[:, 1].std() > _LEAST_TURNING else None
-    by_commands = per_difference is None
-    if per_difference is None:
-        per_difference = _commanded(seconds + stamps[keep[0]] * 1e-9, difference, commands)
-    if radius is None or per_difference is None:
-        return None
-    return WheelGeometry(radius, radius / per_difference, by_commands)
+    for at, gone in _paths(odometry, origin_ns):
+        heard = np.searchsorted(at, seconds[later], side="right") - np.searchsorted(at, seconds)
+        whole = (lasted > 0.5 * _WINDOW_S) & (lasted < 2.0 * _WINDOW_S) & (heard > 1)  # no silence in it
+        if whole.sum() < _FEWEST:
+            continue
+        path = np.stack([np.interp(seconds, at, gone[:, k]) for k in range(2)], axis=1)
+        rates, means = (((x[later] - x)[whole] / lasted[whole, None]) for x in (angles, path))
+        difference = rates[:, 1] - rates[:, 0]
+        radius = _slope(rates.mean(axis=1), means[:, 0])
+        per_difference = _slope(difference, means[:, 1]) if means[:, 1].std() > _LEAST_TURNING else None
+        by_commands = per_difference is None
+        if per_difference is None:
+            per_difference = _commanded(seconds[whole] + origin_ns * 1e-9, difference, commands)
+        if radius is not None and per_difference is not None:
+            return WheelGeometry(radius, radius / per_difference, by_commands)
+    return None
+
+
+def _paths(odometry: Sequence[OdometryEvent], origin_ns: int) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Times ``(n,)`` [s] and way along the heading [m] and turn [rad] ``(n, 2)`` since the first, in order of time.
+
+    First those of the poses: the driver has summed them up from each of its readings, of which silences and twists at
+    single times show a part only. Then those of the twists.
+    """
+    rows = [
+        (e.stamp_ns - origin_ns, *e.position[:2], quaternion_yaw(e.orientation), e.linear[0], e.angular[2])
+        for e in sorted(odometry, key=lambda e: e.stamp_ns)
+    ]
+    table = np.array(rows, dtype=float)
+    table[:, 0] *= 1e-9
+    for columns in ((1, 2, 3), (4, 5)):  # the gate refuses some
+        known = table[np.isfinite(table[:, columns]).all(axis=1)]
+        if len(known) < _FEWEST:
+            continue
+        at, told = known[:, 0], known[:, columns]
+        if len(columns) == 2:
+            steps = 0.5 * (told[1:] + told[:-1]) * np.diff(at)[:, None]
+        else:
+            turns = np.remainder(np.diff(told[:, 2]) + math.pi, math.tau) - math.pi
+            heading = told[:-1, 2] + 0.5 * turns
+            ways = np.diff(told[:, :2], axis=0)
+            steps = np.column_stack([(ways * np.column_stack([np.cos(heading), np.sin(heading)])).sum(axis=1), turns])
+        yield at, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
 def _commanded(times: FloatArray, difference: FloatArray, commands: Sequence[ControlEvent]) -> float | None:
