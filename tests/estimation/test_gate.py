@@ -209,18 +209,18 @@ def test_yaw_rates_of_odometry_are_bounded_in_both_directions(gate):
     assert gate.rejections == {"odometry.twist_yaw_rate_bound": 1}
 
 
-def frozen_imu(rate, acceleration=9.81):
-    return [replace(imu(1.0 + 0.05 * k, rate), linear_acceleration=np.array([0, 0, acceleration])) for k in range(60)]
+def repeated_imu(rates, accelerations):
+    values = dict(angular_velocity=np.array(rates), linear_acceleration=np.array(accelerations))
+    return [replace(imu(1.0 + 0.05 * k), **values) for k in range(60)]
 
 
 def test_an_imu_that_repeats_itself_is_frozen_until_it_measures_again(gate):
-    passed = [gate.check(event) for event in frozen_imu(0.2)]
+    passed = [gate.check(event) for event in repeated_imu((0.004, -0.08, 0.02), (-0.1, 0.05, 10.3))]
     assert [event is not None for event in passed] == [k <= 20 for k in range(60)]  # of the first second
     assert gate.rejections == {"imu.frozen": 39}
     assert any(isinstance(note, Grave) for note in gate.notes)
     assert gate.check(imu(5.0, 0.21)) is not None
 
 
-@pytest.mark.parametrize(("rate", "acceleration"), [(0.0, 9.81), (0.2, 0.0)])
-def test_an_imu_without_noise_at_rest_or_without_accelerometer_may_repeat_itself(gate, rate, acceleration):
-    assert all(gate.check(event) is not None for event in frozen_imu(rate, acceleration))
+def test_a_simulated_imu_without_noise_may_repeat_itself(gate):
+    assert all(gate.check(event) is not None for event in repeated_imu((0.0, 0.0, 0.2), (0.0, 0.1, 9.81)))

@@ -104,7 +104,7 @@ def write(folder, world: World, commands=False, odometry=True, silent=(), unseen
                 if odometry and not inside(stamp, silent):
                     bag.odometry("/odom", stamp, (x, y, yaw), (event.linear[0], event.angular[2]))
                 if imu:
-                    bag.imu("/imu", stamp, (0.01, -0.01, TURN + 0.002), (0.1, 0.2, 9.8))
+                    bag.imu("/imu", stamp, (0.01, -0.01, TURN + 0.002), (0.0, 0.2, 9.8))
                 bag.truth("/truth", stamp, (x, y, 0.0), (0, 0, math.sin(yaw / 2), math.cos(yaw / 2)))
             elif isinstance(event, ControlEvent):
                 if commands and not inside(stamp, silent):

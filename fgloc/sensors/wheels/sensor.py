@@ -178,7 +178,7 @@ def fit_geometry(
         per_difference = _slope(difference, means[:, 1]) if means[:, 1].std() > _LEAST_TURNING else None
         by_commands = per_difference is None
         if per_difference is None:
-            per_difference = _commanded(seconds[whole] + origin_ns * 1e-9, difference, commands)
+            per_difference = _commanded(np.asarray(seconds[whole] + origin_ns * 1e-9), difference, commands)
         if radius is not None and per_difference is not None:
             return WheelGeometry(radius, radius / per_difference, by_commands)
     return None
