@@ -258,7 +258,7 @@ class _Search:
             if mistake.values:
                 self._correct(mistake.code, mistake.sentence, mistake.section, **mistake.values)
             else:  # without the wheels' motion landmarks alone still tell the pose
-                severity = Severity.WARNING if placed else Severity.ERROR
+                severity = Severity.ERROR if mistake.grave and not placed else Severity.WARNING
                 self._setup.append(Finding(mistake.code, mistake.sentence, severity))
         if parts.landmark_map is None:
             return False

@@ -358,18 +358,16 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
                 f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}.") and not r.endswith(".frozen")
             )
             too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
-            unit, settings = "", _SETTINGS[kind]
-            if 2 * too_fast > count:
-                unit = " Angles that change so fast are ticks or degrees, not radians."
-                settings = "wheels.drive and its ticks_per_turn (docs/drives.md)"
             used = sensor not in _MOTION or result.found is None or result.found.wheels in ("", sensor)
-            remedy = f"look at {settings}" if used else "the run's motion is of another source"
-            yield Finding(
-                f"{sensor}.dropped",
-                f"{count} messages of {sensor} were dropped ({reasons}); {remedy}.{unit}",
-                Severity.WARNING if used else Severity.NOTE,
-                value=float(count),
-            )
+            remedy = f"look at {_SETTINGS[kind]}" if used else "the run's motion is of another source"
+            text = f"{count} messages of {sensor} were dropped ({reasons}); {remedy}."
+            if 2 * too_fast > count:
+                text = (
+                    f"Velocities in {too_fast} messages of joints were beyond what wheels reach and were left out; "
+                    "positions of these messages are used where there are any. If they count ticks or degrees, set "
+                    "wheels.drive with its ticks_per_turn (docs/drives.md); else record velocities in rad/s."
+                )
+            yield Finding(f"{sensor}.dropped", text, Severity.WARNING if used else Severity.NOTE, value=float(count))
 
 
 def _prior_sigmas(result: RunData) -> str:

@@ -267,12 +267,14 @@ class RawMistake(NamedTuple):
         sentence: for the user.
         section: of ``robot.yaml``.
         values: that undo it; empty where no settings do.
+        grave: whether the poses would be wrong, or there would be none.
     """
 
     code: str
     sentence: str
     section: str
     values: Mapping[str, object]
+    grave: bool = True
 
 
 Joiner = Callable[[Event, int], Event]

@@ -175,3 +175,76 @@ def test_joints_that_tell_no_way_are_named_before_a_run(tmp_path, per_turn, driv
     info = inspect_all(tmp_path / "bag", None, given)
     codes = [f.code for f in info.found if f.severity is Severity.ERROR]
     assert codes == ([] if code is None else [code])
+
+
+CORNERS = ["front_left", "front_right", "rear_left", "rear_right"]
+MECANUM = {"kind": "mecanum", "wheels": CORNERS, "radius": 0.014, "half_sum": 0.369}
+TWO = {"left_joint": "front_left", "right_joint": "front_right", "left_radius": 0.07, "right_radius": 0.07}
+
+
+def joints_of(folder, angle, rate=None, odometry=False):
+    """Four wheels for 12 s whose driver reports angles, and rates, in a unit of its own."""
+    with BagWriter(folder / "bag") as bag:
+        for k in range(600):
+            stamp, t = round((1.0 + 0.02 * k) * 1e9), 0.02 * k
+            values = {"position": [] if angle is None else [angle(t)] * 4}
+            values |= {} if rate is None else {"velocity": [rate(t)] * 4}
+            bag.joints("/joints", stamp, CORNERS, **values)
+            if odometry:
+                bag.odometry("/odom", stamp, (0.1 * t, 0.0, 0.0), (0.1, 0.0))
+    return folder / "bag"
+
+
+def whole_ticks(t):
+    return float(round(42.0 * (3.0 * t + math.sin(t))))
+
+
+@pytest.mark.parametrize(
+    ("angle", "rate", "wheels", "code", "severity"),
+    [
+        (whole_ticks, lambda t: 900.0, {"drive": MECANUM}, "wheels.ticks", Severity.ERROR),
+        (whole_ticks, lambda t: 900.0, {"drive": MECANUM | {"ticks_per_turn": 42.0}}, None, None),
+        (whole_ticks, None, TWO | {"track": 0.3}, "wheels.ticks", Severity.ERROR),
+        (
+            whole_ticks,
+            None,
+            TWO | {"track": 0.3, "left_radius": 1e-4, "right_radius": 1e-4},
+            None,
+            None,
+        ),  # way per tick
+        (lambda t: 3.3 * t, lambda t: 900.0, {"drive": MECANUM}, "wheels.rates", Severity.WARNING),
+        (lambda t: 3.3 * t, lambda t: 900.0 if t > 11.9 else 3.3, {"drive": MECANUM}, None, None),  # a spike
+        (lambda t: 3.3 * t, None, TWO | {"track": 0.3, "left_joint": "l"}, "wheels.joints", Severity.ERROR),
+    ],
+    ids=["ticks", "known ticks", "two wheels", "way per tick", "rates", "spike", "absent"],
+)
+def test_joints_in_a_unit_of_their_own_or_of_another_name_are_named_before_a_run(
+    tmp_path, angle, rate, wheels, code, severity
+):
+    found = inspect_all(joints_of(tmp_path, angle, rate), None, config_of_file({"wheels": wheels})).found
+    named = {f.code: f.severity for f in found if f.code.startswith("wheels.")}
+    assert named == ({} if code is None else {code: severity})
+
+
+def test_joints_without_angles_whose_rates_cannot_be_used_tell_no_motion(tmp_path):
+    bag = joints_of(tmp_path, None, lambda t: 900.0)
+    found = inspect_all(bag, None, config_of_file({"wheels": {"drive": MECANUM}})).found
+    assert found[0].code == "wheels.rates"
+    assert found[0].severity is Severity.ERROR
+
+
+def test_absent_joints_beside_an_odometry_are_a_warning_that_names_those_there(tmp_path):
+    bag = joints_of(tmp_path, lambda t: 3.3 * t, odometry=True)
+    info = inspect_all(bag, None, config_of_file({"wheels": {"right_joint": "wheel_r"}}))
+    (named,) = [f for f in info.found if f.code == "wheels.joints"]
+    assert named.severity is Severity.WARNING
+    assert "wheel_r" in named.text
+    assert all(name in named.text for name in CORNERS)
+
+
+def test_the_drive_that_joints_show_is_asked_for_not_another_one(tmp_path):
+    found = inspect_all(joints_of(tmp_path, whole_ticks), None, config_of_file({})).found
+    assert found[0].code == "wheels.geometry"
+    assert "skid_steer" in found[0].text
+    assert "ticks_per_turn" in found[0].text
+    assert "left_radius" not in found[0].text

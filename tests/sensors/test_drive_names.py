@@ -66,6 +66,22 @@ def test_init_names_the_drive_and_asks_for_its_geometry(tmp_path, names, angles,
     assert any("wheels.drive" in sentence for sentence in found.missing)
 
 
+@pytest.mark.parametrize(
+    ("names", "angles", "ticks"),
+    [
+        (CORNERS, mecanum, []),
+        (CORNERS, lambda t: np.rint(np.multiply(mecanum(t), 100.0)), ["ticks_per_turn"]),
+        (["left_wheel", "right_wheel"], lambda t: [round(300 * t), round(280 * t)], ["ticks_per_turn"]),
+        (["steering", "traction_wheel"], lambda t: [round(90 * math.sin(t)), 3.3 * t], ["steering_ticks"]),
+        (CORNERS, lambda t: [0.0] * 4, []),  # it stands
+    ],
+    ids=["radians", "ticks", "two wheels", "steering", "standing"],
+)
+def test_positions_that_are_ticks_are_asked_for_the_ticks_of_a_turn(tmp_path, names, angles, ticks):
+    text = first_settings(write(tmp_path, names, angles)).text
+    assert [key for key in ("ticks_per_turn", "steering_ticks") if f"#     {key}:" in text] == ticks
+
+
 def test_wheels_in_no_known_places_are_asked_for(tmp_path):
     found = first_settings(write(tmp_path, ["wheel_1", "wheel_2", "wheel_3"], lambda t: [t, t, t]))
     assert "kind:" not in found.text

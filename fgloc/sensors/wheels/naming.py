@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ _DIAGONAL = 0.1  # share of four wheels' motion in which diagonal ones turn alik
 _SIDE = 0.02  # likewise that tells wheels of one side from one another: below it they turn alike
 _FEWEST = 50  # samples
 _ASIDE, _MOVES = 0.1, 0.05  # share of moving samples that go more sideways than ahead; m/s
+TICKS = "ticks_per_turn:  # positions are ticks: so many a turn of the wheel, or of the motor with radius over the gear"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +61,39 @@ def goes_sideways(told: Sequence[Sequence[float]]) -> float | None:
     return share if _ASIDE < share < 1.0 - _ASIDE else None
 
 
+def count_ticks(joints: Sequence[JointsEvent], names: Sequence[str]) -> bool:
+    """Whether these joints report ticks: whole numbers only while they move, which no angle in radians is."""
+    angles = _values(joints, names, "position") if names else np.empty((0, 0))
+    moved = np.count_nonzero(np.diff(angles, axis=0).any(axis=1))
+    return bool(moved >= _FEWEST and (angles == np.rint(angles)).all())
+
+
 def name_drive(
     joints: Sequence[JointsEvent], odometry: Sequence[OdometryEvent], commands: Sequence[ControlEvent]
 ) -> NamedDrive | None:
-    """Drive with more than two wheels that joints show; None: they show none, or do not tell which."""
+    """Drive with more than two wheels that joints show; None: they show none, or do not tell which.
+
+    Where positions are ticks, its lines have the ticks of a turn.
+    """
     names = tuple(dict.fromkeys(name for event in joints[:100] for name in event.names))
     steering = [name for name in names if _STEERING.search(name)]
     wheels = [name for name in names if name not in steering and not re.search("arm|gripper|head", name, re.I)]
     wheels = [name for name in wheels if "wheel" in name.lower()] or wheels
+    drive = _named(joints, wheels, steering, odometry, commands)
+    if drive is None:
+        return None
+    ticks = ((wheels, TICKS), (steering, "steering_ticks:  # a turn of the steering's encoder"))
+    return replace(drive, lines=(*drive.lines, *(line for of, line in ticks if count_ticks(joints, of))))
+
+
+def _named(
+    joints: Sequence[JointsEvent],
+    wheels: Sequence[str],
+    steering: Sequence[str],
+    odometry: Sequence[OdometryEvent],
+    commands: Sequence[ControlEvent],
+) -> NamedDrive | None:
+    """Drive by the names of wheels and steering, and by how they move."""
     if len(steering) > 2 and len(wheels) == len(steering):
         lists = _list("wheels", wheels), _list("steering_joints", steering)
         why = f"each of {len(wheels)} wheels has a steering joint"

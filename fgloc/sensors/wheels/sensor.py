@@ -44,7 +44,7 @@ from fgloc.sensors.wheels.events import (
     odometry_validator,
 )
 from fgloc.sensors.wheels.motion import INSTALLATION
-from fgloc.sensors.wheels.naming import NamedDrive, name_drive
+from fgloc.sensors.wheels.naming import TICKS, NamedDrive, count_ticks, name_drive
 from fgloc.sensors.wheels.tracks import wheel_names
 from fgloc.types import ControlEvent, Event, FloatArray
 
@@ -293,6 +293,9 @@ def _first_section(look: FirstLook) -> FirstSection:
     if pair is not None and geometry is not None:
         return FirstSection((head, *_found(pair, geometry)))
     drive = name_drive(joints, odometry, commands)
+    if drive is None and pair is not None and count_ticks(joints, (pair.left, pair.right)):
+        sides = (f"left: [{pair.left}]", f"right: [{pair.right}]", "radius:  # m", "track:  # m", TICKS)
+        drive = NamedDrive("differential", "one wheel on each side, whose positions are ticks", sides)
     if drive is not None:
         missing = (
             f"the geometry of the drive: by its joints its kind is {drive.kind} ({drive.why}); fill in "
@@ -340,7 +343,7 @@ def _found(pair: WheelPair, geometry: WheelGeometry) -> tuple[str, ...]:
 def _drive_to_fill_in(drive: NamedDrive) -> tuple[str, ...]:
     return (
         f"# By its joints a drive of kind {drive.kind}: {drive.why}.",
-        "# Fill in to use them (with ticks_per_turn where positions are no radians; all keys: docs/drives.md):",
+        "# Fill in to use them (all keys: docs/drives.md):",
         "# wheels:",
         "#   drive:",
         f"#     kind: {drive.kind}",
@@ -447,6 +450,9 @@ _JUMP = 8.0  # times a usual step of a wheel's angle, and ...
 _LEAST_JUMP_RAD = 0.5  # ... at least so much
 _ROLLS = 2  # jumps of one size that make it a roll-over; an encoder that restarts jumps by any amount
 _SAME_JUMP = 0.03  # share by which they may differ
+_LEAST_RADIUS = 1e-3  # m: a smaller one is a way per tick
+_BEYOND = 0.1  # share of messages whose velocities are beyond the bound: more are no spikes
+_MOST_NAMES = 20
 _WHOLE_TURN = 0.02  # share by which a range may be off one turn to be taken as one turn
 
 
@@ -466,28 +472,97 @@ def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
         )
         found.append(RawMistake("wheels.roll_over", sentence, "wheels", {"angle_range": rolled[0]}))
     wheels = config.wheels
-    joints = [e for e in motion if isinstance(e, JointsEvent) and len(e.position) == len(e.names)]
+    joints = [e for e in motion if isinstance(e, JointsEvent)]
     others = any(isinstance(e, (OdometryEvent, ControlEvent)) for e in motion)
-    if len(joints) < 10 or wheels.source == "none" or (others and wheels.drive is None and wheels.source != "ticks"):
+    if len(joints) < 10 or wheels.source not in ("auto", "ticks"):
         return tuple(found)
-    rate = _joint_rate(joints)
-    if wheels.in_radians and rate > config.gate.max_wheel_rate:
-        sentence = (
-            f"The angles of the wheels' joints change by {rate:.4g} rad/s: they are ticks or degrees, not radians. "
-            "Set wheels.drive with its ticks_per_turn (360 for degrees; docs/drives.md)."
+    if absent := _absent(joints, wheels):
+        found.append(RawMistake("wheels.joints", absent, "wheels", {}, grave=not others))
+    elif not others or wheels.source == "ticks" or wheels.drive is not None or None not in _geometry(wheels):
+        found += _units(joints, config)
+    return tuple(found)
+
+
+def _geometry(wheels: WheelsConfig) -> tuple[float | None, ...]:
+    """Radii and track of two wheels; None: not given."""
+    return wheels.left_radius, wheels.right_radius, wheels.track
+
+
+def _absent(joints: Sequence[JointsEvent], wheels: WheelsConfig) -> str:
+    """Sentence on configured joints that no message holds; empty: there are none."""
+    there = tuple(dict.fromkeys(name for event in joints for name in event.names))
+    if wheels.drive is None:
+        sides = (("left_joint", wheels.left_joint), ("right_joint", wheels.right_joint))
+        absent = [f"{name} (wheels.{key})" for key, name in sides if name is not None and name not in there]
+    else:
+        absent = [name for name in (*wheels.drive.driven, *wheels.drive.steered) if name not in there]
+    if not absent:
+        return ""
+    return (
+        f"No joint state holds {', '.join(absent)}: the joints in the recording are {', '.join(there[:_MOST_NAMES])}. "
+        "Set those of the wheels."
+    )
+
+
+def _units(joints: Sequence[JointsEvent], config: Config) -> list[RawMistake]:
+    """Mistakes of joints that are the motion of the wheels: no geometry is given, or they are in another unit."""
+    wheels, bound = config.wheels, config.gate.max_wheel_rate
+    turning = [e for e in joints if len(e.position) == len(e.names)]
+    names = tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
+    pair = wheel_pair(names) or WheelPair("", "")
+    sides = (wheels.left_joint or pair.left, wheels.right_joint or pair.right)
+    own = wheels.drive.driven if wheels.drive is not None else sides if all(sides) else names
+    radii = _geometry(wheels)[:2] if wheels.drive is None else (wheels.drive.radius,)
+    rate = _joint_rate(turning)
+    ticks = max(radius or 1.0 for radius in radii) > _LEAST_RADIUS and (rate > bound or count_ticks(turning, own))
+    if wheels.drive is None and None in _geometry(wheels):
+        drive = name_drive(joints, (), ())
+        line = (
+            f"wheels.drive, whose kind is {drive.kind} by its joints ({drive.why})"
+            if drive is not None
+            else "wheels.left_radius, wheels.right_radius and wheels.track, or wheels.drive"
         )
-        found.append(RawMistake("wheels.ticks", sentence, "wheels", {}))
-    elif wheels.drive is None and None in (wheels.left_radius, wheels.right_radius, wheels.track):
+        unit = ", with its ticks_per_turn, as positions are ticks or degrees" if ticks else ""
         sentence = (
             "Joint states are the only motion of the wheels in the recording, and how they move the robot is not "
-            "given: set wheels.left_radius, wheels.right_radius and wheels.track, or wheels.drive (docs/drives.md)."
+            f"given: set {line}{unit} (docs/drives.md). `fgloc init` writes the lines that are to be filled in."
         )
-        found.append(RawMistake("wheels.geometry", sentence, "wheels", {}))
-    return tuple(found)
+        return [RawMistake("wheels.geometry", sentence, "wheels", {})]
+    if not wheels.in_radians:
+        return []
+    if ticks:
+        seen = f"change by {rate:.4g} rad/s" if rate > bound else "are whole numbers only"
+        sentence = (
+            f"The angles of the wheels' joints {seen}: they are ticks or degrees, not radians. "
+            "Set wheels.drive with its ticks_per_turn (360 for degrees; docs/drives.md)."
+        )
+        return [RawMistake("wheels.ticks", sentence, "wheels", {})]
+    share = _beyond(joints, own, bound)
+    if share < _BEYOND:
+        return []
+    used = (
+        "Those messages count by their positions alone."
+        if turning
+        else "Without positions they tell no motion: record positions, or velocities in rad/s."
+    )
+    sentence = (
+        f"The velocities of the wheels' joints exceed {bound:g} rad/s in {share:.0%} of the messages: they are in "
+        f"another unit, and are not used there. {used}"
+    )
+    return [RawMistake("wheels.rates", sentence, "wheels", {}, grave=not turning)]
+
+
+def _beyond(joints: Sequence[JointsEvent], names: Sequence[str], bound: float) -> float:
+    """Share of the messages in which one of these joints turns faster than this [rad/s]."""
+    places = [[e.names.index(name) for name in names if name in e.names] for e in joints]
+    given = [(e.velocity, at) for e, at in zip(joints, places, strict=True) if at and len(e.velocity) == len(e.names)]
+    return float(np.mean([(np.abs(rates[at]) > bound).any() for rates, at in given])) if given else 0.0
 
 
 def _joint_rate(joints: Sequence[JointsEvent]) -> float:
     """Rate [rad/s] that the fastest joint exceeds for a tenth of the time, if its angles are radians."""
+    if not joints:
+        return 0.0
     names = joints[0].names
     alike = [e for e in joints if e.names == names]
     times = np.array([e.stamp_ns for e in alike]) * 1e-9
