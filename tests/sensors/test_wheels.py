@@ -276,6 +276,31 @@ def test_a_disagreement_of_twist_and_pose_is_said():
     assert any("disagrees" in note for note in wheels.notes)
 
 
+@pytest.mark.parametrize("source", ["auto", "twist", "pose"])
+def test_a_setting_that_is_made_already_is_not_advised(source):
+    steps = run(stepper(), [odometry(t, (0, 0, 0.34 * t), (0.0, 1.0)) for t in times(1, 3, 20)])
+    _, _, wheels = total(steps, WheelsConfig(source=source))
+    assert wheels.by_twist == (source == "twist")
+    assert any("wheels.source" in note for note in wheels.notes) == (source == "auto")
+
+
+@pytest.mark.parametrize("drive", [None, "differential"])
+def test_angles_whose_messages_come_in_bursts_do_not_jump(drive):
+    """Stamps of receipt: ten messages every 0.2 s, the last nine within a millisecond. A real jump is still found."""
+    geometry = {"left_joint": "l", "right_joint": "r", "left_radius": 0.05, "right_radius": 0.05, "track": 0.3}
+    config = WheelsConfig(source="ticks", **geometry)
+    if drive is not None:
+        made = {"kind": drive, "left": ["l"], "right": ["r"], "radius": 0.05, "track": 0.3}
+        config = WheelsConfig.model_validate({"drive": made})
+    angles = [10.0 * 0.02 * k + (500.0 if k > 250 else 0.0) for k in range(300)]
+    events = [
+        joints(1.0 + 0.2 * (k // 10 + 1) + 1e-4 * (k % 10), angle, angle, ("l", "r")) for k, angle in enumerate(angles)
+    ]
+    pose, _, wheels = total(run(stepper(), events), config)
+    assert wheels.rejections["wheels.encoder_reset"] == 1
+    assert pose[0] == pytest.approx(0.05 * 10.0 * 5.8, abs=0.15)
+
+
 def test_the_pose_bridges_a_long_gap_in_which_the_robot_hardly_moves():
     before = [odometry(t, (0.3 * t, 0.0, 0.0), (0.3, 0.0)) for t in times(0.1, 6, 20)]
     after = [odometry(t, (2.2 + 0.3 * (t - 15.0), 0.0, 0.0), (0.3, 0.0)) for t in times(15.0, 20, 20)]

@@ -12,7 +12,7 @@ from fgloc.config import WheelsConfig
 from fgloc.drives.base import Drive
 from fgloc.errors import ConfigError
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, MAX_TURN, PATIENCE, Track, Twist
+from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, PATIENCE, Track, Twist
 from fgloc.types import FloatArray
 
 Moved = tuple[Twist, FloatArray]  # twist, and its derivatives (3, p) by the drive's parameters
@@ -57,14 +57,15 @@ class DriveTrack(Track):
             self.rejections["wheels.joints_incomplete"] += 1
             self._wait(f"their values are incomplete: {', '.join(names)} need angles or rates, steering an angle")
             return
-        moved = None
+        moved, steady = None, False
         if self._last_ns is not None:
             moved = self._moved(angles, rates, steering, (event.stamp_ns - self._last_ns) * 1e-9)
+            steady = moved is not None and self._possible(moved[0], math.inf)
         before = None if self._moving is None else self._moving[0]
         self._extend(event.stamp_ns, None if moved is None else moved[0], before, None if moved is None else moved[1])
         now = None if rates is None else self._twist(rates, steering)
         self._angles, self._rates, self._steering = angles, rates, steering
-        self._moving = now or moved or self._moving
+        self._moving = now or (moved if steady else self._moving)
         self._reach(event.stamp_ns, *(self._moving or (None,)))
 
     def _moved(
@@ -78,7 +79,7 @@ class DriveTrack(Track):
                 if seconds > self._config.hold_s:  # nobody knows how often it rolled over
                     return None
                 turned = np.array([math.remainder(turn, roll) for turn in turned.tolist()])
-            moved = self._twist(turned * (self._per_position / seconds), between, MAX_SPEED)
+            moved = self._twist(turned * (self._per_position / seconds), between, seconds, MAX_SPEED)
             if moved is not None:
                 return moved
             self.rejections["wheels.encoder_reset"] += 1
@@ -91,19 +92,20 @@ class DriveTrack(Track):
             return None
         return self._twist(rates if self._rates is None else 0.5 * (rates + self._rates), between)
 
-    def _twist(self, rates: FloatArray, steering: FloatArray, fastest: float = math.inf) -> Moved | None:
+    def _twist(
+        self, rates: FloatArray, steering: FloatArray, seconds: float = math.inf, fastest: float = math.inf
+    ) -> Moved | None:
         """Twist of joint rates [rad/s] and steering angles [rad]; None if no robot moves like this.
 
-        Differences of angles may be those of an encoder that jumps: they make no more than ``fastest`` [m/s].
+        Differences of angles may be those of an encoder that jumps: over ``seconds`` they make no more than
+        ``fastest`` [m/s].
         """
         try:
             twist, by, _ = self._drive.moves(rates.tolist(), steering.tolist())
         except np.linalg.LinAlgError:  # steered so far that the wheels do not determine a motion
             return None
         vx, vy, w = twist.tolist()
-        if not math.hypot(vx, vy) < fastest or not abs(w) < MAX_TURN:
-            return None
-        return (vx, vy, w), by
+        return ((vx, vy, w), by) if self._possible((vx, vy, w), seconds, fastest) else None
 
     def _steered(self, event: JointsEvent) -> FloatArray | None:
         """Angles [rad] of the steered joints; None if one is not known."""

@@ -246,6 +246,7 @@ def _advance(
 
 
 MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings beyond them is a reset
+_FIRST_USUAL_S, _USUAL_SHARE = 0.05, 0.05  # between readings, before any came; share of the newest in the mean
 MAX_GAP_S = 5.0  # over a longer gap no difference is used: the robot may have been restarted
 
 
@@ -271,6 +272,7 @@ class Track:
         self._hold_ns = int(config.hold_s * 1e9)
         self._last_ns: int | None = None  # the newest stamp taken in
         self._given_ns = 0  # motion before this time was given to earlier steps
+        self._usual_s = _FIRST_USUAL_S  # mean time between readings
         self._forget()
 
     def ingest(self, step: Step) -> None:
@@ -297,6 +299,11 @@ class Track:
 
     def _forget(self) -> None:
         raise NotImplementedError
+
+    def _possible(self, twist: Twist, seconds: float, fastest: float = MAX_SPEED) -> bool:
+        """Whether a robot can have moved so from one reading to the next; stamps of receipt come in bursts."""
+        share = min(seconds / self._usual_s, 1.0)
+        return math.hypot(*twist[:2]) * share < fastest and abs(twist[2]) * share < MAX_TURN
 
     def _true(self, twist: Twist) -> Twist:
         """Twist of the robot for a reported one: small speeds set to zero, configured gains and slowdown applied."""
@@ -336,6 +343,9 @@ class Track:
 
     def _reach(self, stamp_ns: int, held: Twist | None, by: FloatArray | None = None) -> None:
         """Set the stamp of the newest reading; ``held`` is assumed beyond it."""
+        if self._last_ns is not None:
+            seconds = min((stamp_ns - self._last_ns) * 1e-9, self._config.hold_s)
+            self._usual_s += _USUAL_SHARE * (seconds - self._usual_s)
         self._last_ns = stamp_ns
         if held is not None:
             by = None if by is None else self._true_by(held, by)
@@ -547,13 +557,16 @@ class OdometryTrack(Track):
                     "direction in which the pose moves"
                 ),
             )
-        elif _differ(twist_path, pose_path) or _differ(twist_turn, pose_turn):
-            text = (
-                f"differences of the odometry's pose are used; its twist disagrees: {twist_path:.2f} m and "
-                f"{twist_turn:.2f} rad against {pose_path:.2f} m and {pose_turn:.2f} rad; see wheels.source"
-            )
         else:
-            text = "differences of the odometry's pose are used; its twist agrees"
+            used = "the odometry's twist is used" if insists else "differences of the odometry's pose are used"
+            other = "pose" if insists else "twist"
+            text = f"{used}; its {other} agrees"
+            if _differ(twist_path, pose_path) or _differ(twist_turn, pose_turn):
+                text = (
+                    f"{used}; its {other} disagrees: by the twist {twist_path:.2f} m and {twist_turn:.2f} rad, by the "
+                    f"pose {pose_path:.2f} m and {pose_turn:.2f} rad"
+                )
+                text += "; see wheels.source" if self._config.source == "auto" else ""
         self._mode = "twist" if insists else mode
         self.notes["source"] = text
 
@@ -627,7 +640,8 @@ class TicksTrack(Track):
             if piece is None and reported is not None and seconds <= self._config.hold_s:
                 piece = mean_twist(self._reported, reported)
         self._extend(event.stamp_ns, piece, self._moving)
-        self._angles, self._reported, self._moving = angles, reported, reported or piece or self._moving
+        steady = piece if piece is not None and self._possible(piece, math.inf) else self._moving
+        self._angles, self._reported, self._moving = angles, reported, reported or steady
         self._reach(event.stamp_ns, self._moving)
 
     def _turned(self, angles: tuple[float, float] | None, seconds: float) -> Twist | None:
@@ -641,7 +655,7 @@ class TicksTrack(Track):
                 return None
             left, right = math.remainder(left, roll), math.remainder(right, roll)
         twist = self._twist(left / seconds, right / seconds)
-        if abs(twist[0]) > MAX_SPEED or abs(twist[2]) > MAX_TURN:
+        if not self._possible(twist, seconds):
             self.rejections["wheels.encoder_reset"] += 1
             hint = "; if the angle rolls over, set expert.wheels.angle_range" if roll is None else ""
             self.notes["reset"] = (
