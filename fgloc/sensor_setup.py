@@ -307,12 +307,18 @@ TELLING_MOTION = _WHEELS | {"imu", "image", "sightings"}
 """Roles of which a run needs one: without wheels, sightings tell how the robot moves."""
 
 
+CONVERT = (
+    "Motion that is measured in a message of another type has to be converted: speed and steering to "
+    "ackermann_msgs/AckermannDriveStamped (docs/drives.md), velocity and yaw rate to nav_msgs/Odometry."
+)
+
+
 def _need_motion(facts: StreamFacts) -> None:
     """Refuse a stream in which nothing tells how the robot moves."""
     if not TELLING_MOTION & base_roles(facts.roles):
         raise RecordingError(
             f"{facts.name}: no odometry, joint states or commands, no IMU and no images or sightings; a run needs one "
-            f"of them. Topics: {facts.topics}"
+            f"of them. {CONVERT} Topics: {facts.topics}"
         )
 
 

@@ -11,12 +11,23 @@ from pathlib import Path
 
 import yaml
 
-from fgloc.config import CAMERA_ROLES, Config, Role, camera_role, config_of, config_of_file, optional_roles
+from fgloc.config import (
+    CAMERA_ROLES,
+    Config,
+    Role,
+    camera_role,
+    config_of,
+    config_of_file,
+    one_line,
+    optional_roles,
+    with_value,
+)
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
+from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.info import LACKING, RecordingInfo, inspect_recording, placing_roles
 from fgloc.recording.reader import Recording, is_derived
@@ -93,6 +104,7 @@ class _Seen:
     has_map: bool  # beside the bag
     frames: tuple[str, ...]
     sections: tuple[FirstSection, ...]
+    others: Mapping[Role, tuple[str, ...]]  # topics that could each play a role beyond the built-in ones
 
 
 Ask = Callable[[Asked], Mapping[str, str] | None]
@@ -204,7 +216,7 @@ def with_findings(text: str, findings: Sequence[Finding]) -> str:
         for key, value in finding.lines.items():
             before = values.get(key)
             if before is not None and value.startswith("{"):
-                value = "{" + before[1].strip("{}") + ", " + value.strip("{}") + "}"
+                value = one_line({**yaml.safe_load(before[1]), **yaml.safe_load(value)})
             values[key] = (finding.text.partition(": set ")[0] + ".", value)
     written: dict[str, list[str]] = {}
     for key, (why, value) in values.items():
@@ -257,6 +269,9 @@ def _places(lines: Sequence[str]) -> list[str]:
 
 def _look(bag: Path) -> _Seen:
     config = _with_cameras(bag, Config())
+    others = _others(bag, config)
+    for role, (first, *_) in others.items():
+        config = with_value(config, f"recording.topics.{role}", first)
     wanted = registry.first_settings()
     events: dict[type[Event], list[Event]] = {kind: [] for of in wanted for kind in of.events}
 
@@ -276,7 +291,7 @@ def _look(bag: Path) -> _Seen:
         _look_at_optional(bag, config, roles.values(), watch)
         look = FirstLook(info.roles, events, recording, has_map, landmark_map)
         frames = tuple(name for name in BASE_NAMES if name in recording.frames)
-        return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted))
+        return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted), others)
 
 
 _MOST_OPTIONAL = 500  # messages of such a topic
@@ -291,6 +306,18 @@ def _look_at_optional(bag: Path, config: Config, taken: Collection[str], watch: 
                 for message in islice(recording.messages([topic]), _MOST_OPTIONAL):
                     for event in recording.decode(message, role):
                         watch(event)
+
+
+def _others(bag: Path, config: Config) -> dict[Role, tuple[str, ...]]:
+    """Topics of each role of an outside sensor that several topics could play, the one with most messages first."""
+    with Recording(bag, config.recording) as recording:
+        roles, topics = recording.roles, sorted(recording.topics, key=lambda t: (-t.count, t.name))
+    found = {}
+    for stream in (stream for sensor in outside_sensors() for stream in sensor.streams):
+        fitting = tuple(t.name for t in topics if t.count and t.message_type in stream.converters)
+        if len(fitting) > 1 and stream.role not in (*roles, *optional_roles()):
+            found[stream.role] = fitting
+    return found
 
 
 def _with_cameras(bag: Path, config: Config) -> Config:
@@ -342,6 +369,9 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
             yield f"    {role}: {seen.info.roles[role]}  # {meaning}"
         else:
             yield f"    # {role}:  # not found: {meaning}"
+    for role, (first, *rest) in seen.others.items():
+        yield f"    {role}: {first}  # or {', '.join(rest)}"
+        missing.append(f"which topic is the {role}: {first} is taken, {', '.join(rest)} could be it too")
     for problem in seen.info.problems:
         yield f"    # to be settled: {problem}"
     if seen.frames:

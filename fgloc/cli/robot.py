@@ -64,7 +64,7 @@ def init(
     from fgloc.config import base_roles, load_config
     from fgloc.files.outputs import write_text
     from fgloc.motion_noise import with_motion_noise
-    from fgloc.sensor_setup import TELLING_MOTION
+    from fgloc.sensor_setup import CONVERT, TELLING_MOTION
 
     found = first_settings(bag, ask if asks() else None)
     with run_bar("init") as progress:
@@ -84,7 +84,7 @@ def init(
     if not TELLING_MOTION & base_roles(found.roles):
         raise ConfigError(
             f"{bag}: no run is possible, as no topic tells how the robot moves: give one under recording.topics in "
-            f"{out}, or record odometry, joint states, commands, an IMU or images of markers"
+            f"{out}, or record odometry, joint states, commands, an IMU or images of markers. {CONVERT}"
         )
     if not {"image", "sightings"} & base_roles(found.roles):
         if "uwb" in found.roles and not load_config(out).uwb.anchors:  # type: ignore[attr-defined]

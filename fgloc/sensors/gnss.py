@@ -17,14 +17,14 @@ Source of the transformation: NIMA TR8350.2, Department of Defense World Geodeti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from fgloc.config import GateConfig, Section
+from fgloc.config import Config, GateConfig, Section
 from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, Stream, When
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
@@ -108,8 +108,8 @@ def from_fix(message: Any, when: When) -> SensorEvent:
 
 
 def check(event: GnssEvent, gate: GateConfig) -> GnssEvent | str:
-    """The event, or why it cannot be used."""
-    if not event.fixed:
+    """The event, or why it cannot be used: receivers without a fix say so, or report zeros."""
+    if not event.fixed or event.latitude == event.longitude == 0.0:
         return "no_fix"
     if not math.isfinite(event.latitude + event.longitude) or not np.isfinite(event.cov).all():
         return "non_finite"
@@ -178,25 +178,65 @@ class Multipath(EventFailure):
 _FIRST = 10  # positions whose median is proposed for the origin
 
 
+def _origin(fixes: Sequence[GnssEvent]) -> str:
+    """Median of some positions, as `gnss.origin` has it."""
+    about = np.median([(e.latitude, e.longitude, e.altitude) for e in fixes], axis=0)
+    altitude = float(about[2]) if math.isfinite(about[2]) else 0.0
+    return f"[{about[0]:.8f}, {about[1]:.8f}, {altitude:.2f}]"
+
+
 def _first_section(look: FirstLook) -> FirstSection:
     """A proposal for the origin, for the user to take: how far positions may be trusted is not told by a recording."""
     passed = (check(event, GateConfig()) for event in look.events[GnssEvent] if isinstance(event, GnssEvent))
     fixes = [event for event in passed if isinstance(event, GnssEvent)]
     if not fixes:
         return FirstSection()
-    about = np.median([(e.latitude, e.longitude, e.altitude) for e in fixes[:_FIRST]], axis=0)
-    altitude = float(about[2]) if math.isfinite(about[2]) else 0.0
     lines = (
         "gnss:",
         "  # Positions are used once the origin of the map is given; these are the first ones. Receivers err alike for",
         "  # a minute, by more than they say: sigma_scale 5 is a cautious start.",
-        f"  # origin: [{about[0]:.8f}, {about[1]:.8f}, {altitude:.2f}]  # latitude, longitude [°], altitude [m]",
+        f"  # origin: {_origin(fixes[:_FIRST])}  # latitude, longitude [°], altitude [m]",
         "  # sigma_scale: 5.0",
         "  # antenna: [0.0, 0.0]  # x y [m] in the base frame; else tf, else the base",
     )
     return FirstSection(
         lines, ("where on the earth the map's origin is, without which GNSS is not used (gnss.origin)",)
     )
+
+
+class GnssChecks:
+    """Checks of a topic of positions: messages without a fix, and an origin where none is given."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._unfixed: list[int] = []  # places among the messages
+        self._first: list[GnssEvent] = []
+
+    def add(self, event: Event) -> None:
+        """Add one event."""
+        assert isinstance(event, GnssEvent)
+        checked = check(event, GateConfig())
+        if checked == "no_fix":
+            self._unfixed.append(self._count)
+        elif isinstance(checked, GnssEvent) and len(self._first) < _FIRST:
+            self._first.append(checked)
+        self._count += 1
+
+    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
+        """Faults that were found, one sentence each."""
+        found = []
+        if self._unfixed:
+            at = ", ".join(f"{seconds[k]:.1f}" for k in (self._unfixed[0], self._unfixed[-1]) if k < len(seconds))
+            found.append(
+                f"{topic}: {len(self._unfixed)} of {self._count} messages hold no fix (by their status, or latitude "
+                f"and longitude are 0) and are not used; the first and the last at {at} s."
+            )
+        section: GnssConfig = getattr(config, Gnss.name, GnssConfig())
+        if section.origin is None and self._first:
+            found.append(
+                f"{topic}: the first positions are at gnss.origin: {_origin(self._first)}, if the map begins there."
+            )
+        return found
 
 
 # --- The sensor -------------------------------------------------------------------------------------------------------
@@ -210,7 +250,12 @@ class Gnss:
     Config: ClassVar[type[Section]] = GnssConfig
     streams: ClassVar[tuple[Stream, ...]] = (
         Stream(
-            "gnss", GnssEvent, {"sensor_msgs/msg/NavSatFix": from_fix}, ("fix", "gnss/fix", "gps/fix"), False, check
+            "gnss",
+            GnssEvent,
+            {"sensor_msgs/msg/NavSatFix": from_fix},
+            ("fix", "gnss/fix", "gps/fix"),
+            check=check,
+            findings=GnssChecks,
         ),
     )
     failures: ClassVar[tuple[type[Section], ...]] = (Multipath,)

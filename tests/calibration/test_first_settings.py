@@ -8,6 +8,7 @@ import yaml
 
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file
+from fgloc.recording.info import inspect
 from fgloc.sensors.maps import write_map
 from fgloc.types import Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
@@ -63,3 +64,36 @@ def test_an_odometry_that_nobody_calibrated_has_wider_priors_where_a_map_can_tel
 @pytest.mark.parametrize(("sign", "source"), [(1.0, Config().wheels.source), (-1.0, "pose")])
 def test_a_yaw_rate_with_the_wrong_sign_is_not_used(tmp_path, sign, source):
     assert settings(tmp_path, sign=sign).wheels.source == source
+
+
+def with_positions(folder, topics, without_fix=5):
+    """Odometry beside positions of receivers, whose first messages are all zero."""
+    with BagWriter(folder / "bag") as bag:
+        for k in range(100):
+            stamp = START_NS + k * 50_000_000
+            bag.odometry("/odom", stamp, (0.02 * k, 0.0, 0.0), (0.4, 0.0))
+            for topic in topics:
+                place = (0.0, 0.0, 0.0) if k < without_fix else (45.5 + 2e-7 * k, 9.25, 229.0)
+                bag.satellite_fix(topic, stamp, place, (0.04, 0.04, 0.09))
+    return folder / "bag"
+
+
+@pytest.mark.parametrize("topics", [["/gps"], ["/front/gps", "/rear/gps"]])
+def test_positions_are_found_with_a_value_of_the_origin_to_be_pasted(tmp_path, topics):
+    bag = with_positions(tmp_path, topics)
+    text = first_settings(bag).text
+    (line,) = [line for line in text.splitlines() if "origin:" in line]
+    made = config_of_file(yaml.safe_load(text.replace(line, line.replace("# origin", "origin"))))
+    assert made.gnss.origin == pytest.approx((45.5, 9.25, 229.0), abs=1e-4)
+    found = inspect(bag, made)
+    assert found.roles["gnss"] == topics[0]
+    assert not found.problems
+
+
+def test_positions_without_a_fix_are_named_and_not_used(tmp_path):
+    bag = with_positions(tmp_path, ["/fix"], without_fix=7)
+    sound, origin = inspect(with_positions(tmp_path / "sound", ["/fix"], 0), Config()), "gnss.origin: [45.5"
+    named, usual = ([text for text in info.findings if "/fix" in text] for info in (inspect(bag, Config()), sound))
+    assert len(named) == len(usual) + 1
+    assert any("7 of 100" in text for text in named)
+    assert any(origin in text for text in named)
