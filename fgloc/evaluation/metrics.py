@@ -11,7 +11,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, TypeVar
 
@@ -25,7 +25,7 @@ from fgloc.config import Config, base_role
 from fgloc.diagnosis.pairs import MAD
 from fgloc.diagnosis.truth import truth_sentence
 from fgloc.errors import CovarianceError, TrajectoryError
-from fgloc.evaluation.judgements import Judgement, judgements
+from fgloc.evaluation.judgements import Judgement, episodes, judgements
 from fgloc.results import RunData
 from fgloc.stats import chi2_bound
 from fgloc.types import Finding, FloatArray, IntArray, Severity, Trajectory, ordered
@@ -234,7 +234,16 @@ def all_findings(
     gross = size is not None and size.gross
     judged = [frame] if frame is not None else [] if gross else _optimistic(result, nees_over_3)
     misjudged = [finding for finding in judged if finding.code not in known]
-    return ordered([*result.findings, *_sized(size), *misjudged, *_dropped(result, rejections, keyframes)])
+    return ordered([*_timed(result), *_sized(size), *misjudged, *_dropped(result, rejections, keyframes)])
+
+
+def _timed(result: RunData) -> list[Finding]:
+    """Findings of the run; when the robot was lifted is as the run judged it, where it did."""
+    lifts = [j for j in episodes(result.decisions, result.trajectory) if j.kind == "lifted"]
+    if not lifts:
+        return list(result.findings)
+    text = f"The robot was lifted or turned by hand, {', '.join(lift.when for lift in lifts)}."
+    return [replace(f, text=text, value=lifts[0].from_s) if f.code == "motion.lifted" else f for f in result.findings]
 
 
 def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | None:

@@ -28,7 +28,7 @@ from fgloc.config import Config, WheelsConfig, config_of, load_config
 from fgloc.evaluation.metrics import all_findings, compute_metrics
 from fgloc.recording.info import inspect
 from fgloc.runner import run
-from fgloc.types import Finding, Severity, ordered
+from fgloc.types import Decision, Finding, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import load_train_config
 
@@ -246,6 +246,23 @@ def test_the_gravest_finding_comes_first(bag):
     assert all(name in said[2].text for name in ("landmarks.range_scale_sigma", "wheels.scale_sigma"))
     assert "camera." not in said[2].text  # there is none
     assert said[3].value == 40
+
+
+def test_when_the_robot_was_lifted_is_told_by_one_source(bag):
+    result = run(bag, bag.parent / "map.yaml", Config(), "online")
+    start, nan = int(result.trajectory.stamps_ns[0]), math.nan
+    lifts = tuple(
+        Decision(k, start + round(k * 1e8), "lift", -1, nan, 100.0, 3, 0.0, "tilted", 26.0) for k in range(12, 25)
+    )
+    told = (Finding("motion.lifted", "The robot was lifted from 1.5 to 2.2 s.", Severity.WARNING, value=1.5),)
+    lifted = replace(result, findings=told, decisions=(*result.decisions, *lifts))
+    metrics = compute_metrics(lifted, Config())
+    (judged,) = [j for j in metrics.judgements if j.kind == "lifted"]
+    (finding,) = [f for f in metrics.findings if f.code == "motion.lifted"]
+    assert finding.value == judged.from_s
+    assert judged.when in finding.text
+    (kept,) = [f for f in compute_metrics(replace(result, findings=told), Config()).findings if f.code == told[0].code]
+    assert kept.value == 1.5
 
 
 def test_one_line_is_given_for_each_key():
