@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.assembly import Assembly
-from fgloc.config import CAMERA_ROLES, Config, camera_role, setting
+from fgloc.config import CAMERA_ROLES, Config, camera_role, one_line, setting
 from fgloc.frames import rotation_of, sensor_pose
 from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate, camera_block
@@ -387,17 +387,18 @@ def contradictions(found: InstallationFound, config: Config) -> list[Finding]:
 
 def _late_clocks(off: Sequence[Setting], config: Config) -> Iterator[Finding]:
     """Clocks that are late or early; all of them to one side: the gyro's, which they are compared to."""
+    all_given = {str(r): offset for r, offset in config.recording.stamp_offset_s.items()}
     late = {s.name.split(".")[1]: (s.given, -s.unpulled, s.sigma) for s in off}
     if len(off) > 1 and len({s.unpulled > 0.0 for s in off}) == 1:
         mean = sum(s.unpulled for s in off) / len(off)
-        given = {str(r): offset for r, offset in config.recording.stamp_offset_s.items()}.get("imu", 0.0)
-        late = {"imu": (given, mean, max(s.sigma for s in off))}
+        late = {"imu": (all_given.get("imu", 0.0), mean, max(s.sigma for s in off))}
     for role, (given, late_s, sigma) in late.items():
+        line = one_line(all_given | {role: round(given - late_s, 3)})
         text = (
             f"The stamps of {role} are {abs(late_s):.3f} ± {sigma:.3f} s {'late' if late_s > 0.0 else 'early'} against "
-            f"the others: set recording.stamp_offset_s: {{{role}: {given - late_s:.3f}}}, or correct the others."
+            f"the others: set recording.stamp_offset_s: {line}, or correct the others."
         )
-        lines = {"recording.stamp_offset_s": f"{{{role}: {given - late_s:.3f}}}"}
+        lines = {"recording.stamp_offset_s": line}
         yield Finding(f"clock.{role}", text, Severity.WARNING, lines, late_s, sigma)
 
 

@@ -98,9 +98,9 @@ class Conventions:
         return {finding.code for finding in self.findings}
 
     def earlier(self, role: str, late_s: float) -> dict[str, Any]:
-        """Line that makes the stamps of a role earlier by so much."""
-        given = {str(r): offset for r, offset in self.config.recording.stamp_offset_s.items()}.get(role, 0.0)
-        return {"recording.stamp_offset_s": {role: round(given - late_s, 3)}}
+        """Line that makes the stamps of a role earlier by so much, and leaves those of the others as they are set."""
+        given = {str(r): offset for r, offset in self.config.recording.stamp_offset_s.items()}
+        return {"recording.stamp_offset_s": given | {role: round(given.get(role, 0.0) - late_s, 3)}}
 
     def exchanged_joints(self) -> dict[str, Any]:
         """Lines that exchange the joints of left and right wheel; empty: they have no names."""

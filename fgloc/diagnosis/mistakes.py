@@ -125,7 +125,7 @@ def of_camera(findings: Iterable[Finding], name: str) -> list[Finding]:
         "recording.sightings_pose": f"cameras.{name}.pose",
         "recording.sightings_axes": f"cameras.{name}.axes",
         **{f"recording.topics.{role}": f"cameras.{name}.{role}" for role in CAMERA_ROLES},
-        **{f"{{{role}: ": f"{{{name}/{role}: " for role in CAMERA_ROLES},
+        **{f"{before}{role}: ": f"{before}{name}/{role}: " for role in CAMERA_ROLES for before in ("{", ", ")},
         **{f"[{role}]": f"[{name}/{role}]" for role in CAMERA_ROLES},
     }
 

@@ -153,6 +153,13 @@ def test_fault_19_the_remedy_counts_what_is_configured_already():
     assert line["sightings"] == pytest.approx(0.5 - DELTA, abs=0.03)
 
 
+def test_fault_19_the_remedy_of_one_clock_keeps_those_of_the_others():
+    """Set in the place of the line that is there, it does not call for the next remedy."""
+    settings = config(recording={"stamp_offset_s": {"imu": 0.2}})
+    found = alone(diagnose(events(beacons(), late=DELTA), beacons(), settings=settings), "clock.sightings")
+    assert yaml.safe_load(found.lines["recording.stamp_offset_s"]).keys() == {"imu", "sightings"}
+
+
 def test_fault_19_clock_offset_without_a_map():
     found = alone(diagnose(events(beacons(), late=0.3), None), "clock.sightings")
     assert abs(found.value - 0.3) < 4.0 * found.sigma < 0.1
