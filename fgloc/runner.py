@@ -25,7 +25,19 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
 from fgloc.results import RunData
 from fgloc.sensors import registry
-from fgloc.types import Estimate, Finding, FloatArray, Grave, Ground, Protection, Severity, Trajectory, note, ordered
+from fgloc.types import (
+    Estimate,
+    Finding,
+    FloatArray,
+    Grave,
+    Ground,
+    Lost,
+    Protection,
+    Severity,
+    Trajectory,
+    note,
+    ordered,
+)
 
 # --- Results besides poses, and their sentences -------------------------------------------------
 
@@ -69,7 +81,7 @@ class Outcome:
             *note("motion.model", map(sentence, parts.localizer.motion.mistakes), Severity.ERROR),
             *note("setup.unseen", map(sentence, hints), Severity.WARNING),
             *(f for f in seen_in_images if f.code not in known),
-            *_graded("recording", recording.notes),
+            *_graded("recording", (*recording.notes, *recording.unreadable)),
             *note("clock", map(sentence, replay.clocks.notes)),
             *_graded("run", parts.sentences),
         ]
@@ -95,7 +107,10 @@ def _hints(recording: Recording, parts: Assembly, replay: Replay) -> list[str]:
 def _graded(code: str, texts: Iterable[str]) -> Iterator[Finding]:
     """Findings of a part of the run: warnings of what it calls grave."""
     for text in texts:
-        yield Finding(code, sentence(text), Severity.WARNING if isinstance(text, Grave) else Severity.NOTE)
+        if isinstance(text, Lost):
+            yield Finding(f"{code}.lost", sentence(text), Severity.WARNING, value=text.share)
+        else:
+            yield Finding(code, sentence(text), Severity.WARNING if isinstance(text, Grave) else Severity.NOTE)
 
 
 def sentence(note: str) -> str:

@@ -401,6 +401,18 @@ class Grave(str):
     """A note of which a warning is made: data are damaged, in another unit, or not of this map."""
 
 
+class Lost(Grave):
+    """A note that part of a recording cannot be read; ``share`` of it as far as that is known."""
+
+    share: float
+
+    def __new__(cls, text: str, share: float) -> Lost:
+        """Note with the share that is lost, from 0 to 1."""
+        made = super().__new__(cls, text)
+        made.share = share
+        return made
+
+
 REMARKS = ("run", "recording", "batch")
 """Codes of sentences on what a run does with its recording and settings; nothing was compared."""
 

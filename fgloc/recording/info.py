@@ -314,7 +314,7 @@ def inspect_recording(
     """Inspect an opened recording; `watch` is called with each event that is decoded, tf's excepted."""
     times, checks, child_frame = _read_through(recording, watch)
     start_ns = min((t.received[0] for t in times.values() if t.received), default=0)
-    undecodable = dict(recording.undecodable)
+    unreadable = recording.unreadable
     reports: list[TopicReport] = []
     findings: list[str] = []
     for info in recording.topics:
@@ -325,7 +325,7 @@ def inspect_recording(
             seconds = np.asarray((int64(times[info.name].decoded) - start_ns) * 1e-9)
             with np.errstate(all="ignore"):  # absurd magnitudes overflow: that is what is looked for
                 findings += checks[info.name].findings(info.name, seconds, config)
-    findings += [f"{topic}: {n} messages cannot be decoded." for topic, n in undecodable.items()]
+    findings += unreadable
     ids = next((c.ids for c in checks.values() if isinstance(c, SightingsChecks)), Counter())
     return RecordingInfo(
         path=recording.path,

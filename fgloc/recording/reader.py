@@ -26,7 +26,7 @@ from fgloc.config import (
 )
 from fgloc.errors import RecordingError
 from fgloc.recording.messages import Decoder
-from fgloc.recording.storage import RawMessage, Storage
+from fgloc.recording.storage import RawMessage, Storage, lost
 from fgloc.recording.transforms import FrameTree
 from fgloc.sensors import registry
 from fgloc.sensors.base import Converter, When, matrix, nanoseconds, vector, xyz, xyzw
@@ -444,6 +444,16 @@ class Recording:
     def notes(self) -> tuple[str, ...]:
         """Notes for the user, one sentence each. Damage is noted when reading meets it."""
         return (*self._storage.notes, *self._notes)
+
+    @property
+    def unreadable(self) -> tuple[str, ...]:
+        """Sentence for each topic with messages that the latest pass of `events` could not decode."""
+        counts = {topic.name: topic.count for topic in self.topics}
+        of = {topic: max(n, counts.get(topic, 0)) for topic, n in self.undecodable.items()}
+        return tuple(
+            lost(f"{topic}: {n} of {of[topic]} messages cannot be decoded.", n / of[topic])
+            for topic, n in self.undecodable.items()
+        )
 
     @property
     def span_ns(self) -> tuple[int, int]:

@@ -28,6 +28,53 @@ from rosbags.rosbag1 import Writer
 
 from fgloc.recording.limits import Budget, check_tables, decompressed
 
+# --- Extent of a damaged file ---------------------------------------------------------------------------------------
+
+_MOST_CUT = 200  # a file of which less than this part is left says nothing of what it was
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """A sound file that holds what could be read of a damaged one."""
+
+    path: Path
+    messages: int
+    lost: float  # share of the damaged file that could not be read, or is known to be missing
+    cut: bool = False  # it ends before its index: how much is missing beyond what `lost` knows is unknown
+
+
+@dataclass(slots=True)
+class _Walk:
+    """Extent of a damaged file, as a pass over its records finds it.
+
+    Attributes:
+        path: the file.
+        sound: bytes that could be read.
+        extent: bytes that it has, or says it had.
+        cut: whether it ends before its index.
+    """
+
+    path: Path
+    sound: int = 0
+    extent: int = 0
+    cut: bool = True
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file as it is."""
+        return self.path.stat().st_size
+
+    @property
+    def lost(self) -> float:
+        """Share of the extent that could not be read."""
+        return max(0.0, 1.0 - self.sound / max(self.size, self.extent))
+
+    def extends_to(self, end: int) -> None:
+        """Take what the file says of its length, unless that is absurd: the number itself is damaged."""
+        if end <= _MOST_CUT * self.size:
+            self.extent = max(self.extent, end)
+
+
 # --- MCAP -------------------------------------------------------------------------------------------------------------
 
 _MAX_NS = 2**63 - 1
@@ -60,24 +107,25 @@ class McapSink:
         self._file.close()
 
 
-def recover_mcap(path: Path, target: Path) -> tuple[int, float]:
-    """Copy what can be read of an MCAP; returns the number of messages and the share of the bytes that is lost.
+def recover_mcap(path: Path, target: Path) -> Recovered:
+    """Copy what can be read of an MCAP.
 
     Raises:
         TooLargeError: its chunks expand to more than its size allows.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    for record, _ in _mcap_records(path):  # first for the channels: those of a damaged chunk are repeated at the end
+    for record in _mcap_records(
+        path, _Walk(path)
+    ):  # first for the channels: those of a damaged chunk are repeated at the end
         if isinstance(record, Schema):
             schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
             channels.setdefault(record.id, record)
-    lost = 0.0
+    walked = _Walk(path)
     with closing(McapSink(target)) as sink:
         ids: dict[int, int] = {}
-        for record, sound in _mcap_records(path):
-            lost = 1.0 - sound / path.stat().st_size
+        for record in _mcap_records(path, walked):
             if not isinstance(record, Message) or record.channel_id not in channels:
                 continue
             if record.channel_id not in ids:
@@ -87,15 +135,15 @@ def recover_mcap(path: Path, target: Path) -> tuple[int, float]:
                     channel.topic, schema.name, schema.encoding, schema.data, channel.message_encoding
                 )
             sink.write(ids[record.channel_id], record.log_time, record.data)
-    return sink.messages, lost
+    return Recovered(target, sink.messages, walked.lost, walked.cut)
 
 
-def _mcap_records(path: Path) -> Iterator[tuple[McapRecord | None, int]]:
-    """Readable records, each with the number of the file's bytes that were sound so far; ends with (None, bytes)."""
+def _mcap_records(path: Path, walk: _Walk) -> Iterator[McapRecord | None]:
+    """Readable records; ``walk`` learns the file's extent."""
     size, budget = path.stat().st_size, Budget(path)
     budget.start_pass()
     with path.open("rb") as file:
-        read = len(file.read(8))  # magic
+        walk.sound = len(file.read(8))  # magic
         while len(frame := file.read(9)) == 9:
             opcode, length = struct.unpack("<BQ", frame)
             payload = file.read(min(length, size - file.tell()))
@@ -107,15 +155,14 @@ def _mcap_records(path: Path) -> Iterator[tuple[McapRecord | None, int]]:
                 sound = True
             else:
                 records, sound = [], False
-            if sound:
-                read += 9 + len(payload)
-            for record in records:
-                yield record, read
+            walk.cut = walk.cut and not (complete and opcode == Opcode.DATA_END)
+            walk.sound += 9 + len(payload) if sound else 0
+            yield from records
             if not complete:
+                walk.extends_to(file.tell() - len(payload) + length)
                 break
         else:
-            read += len(frame) if len(frame) == 8 else 0  # the magic at the end
-    yield None, read
+            walk.sound += len(frame) if len(frame) == 8 else 0  # the magic at the end
 
 
 def _chunk_records(payload: bytes, complete: bool, budget: Budget) -> tuple[list[McapRecord | None], bool]:
@@ -170,35 +217,38 @@ def sqlite_journals(path: Path) -> list[Path]:
     return [file for file in candidates if file.is_file() and file.stat().st_size > 0]
 
 
-def recover_sqlite(path: Path, target: Path) -> tuple[int, float]:
-    """Copy the readable rows into an MCAP; returns their number and the share of the bytes that is lost.
+def recover_sqlite(path: Path, target: Path) -> Recovered:
+    """Copy the readable rows into an MCAP.
 
     Raises:
         TooLargeError: a table is a query.
     """
-    size = path.stat().st_size
+    walk = _Walk(path)
+    walk.sound, walk.cut = walk.size, False  # the pages that are there may be damaged: rows tell
     with path.open("rb") as file:
         header = file.read(100)
-    intended = size
     if len(header) == 100:
         page, pages = struct.unpack(">H", header[16:18])[0], struct.unpack(">I", header[28:32])[0]
-        intended = max(size, (65536 if page == 1 else page) * pages)
+        walk.extends_to((65536 if page == 1 else page) * pages)
     source, options = path, "mode=ro&immutable=1"
     if journals := sqlite_journals(path):
         source, options = target.parent / path.name, "mode=rw"
         for original in (path, *journals):
             shutil.copyfile(original, target.parent / original.name)
+    skipped = 0
     with closing(McapSink(target)) as sink:
         try:
             with closing(sqlite3.connect(f"file:{quote(str(source.absolute()))}?{options}", uri=True)) as database:
                 check_tables(database, path)
-                _copy_rows(database, sink, Budget(path))
+                skipped = _copy_rows(database, sink, Budget(path))
         except sqlite3.Error:
             pass  # damaged beyond the rows already copied
-    return sink.messages, 1.0 - size / intended
+    of_rows = skipped / max(skipped + sink.messages, 1)
+    return Recovered(target, sink.messages, max(walk.lost, of_rows), walk.cut)
 
 
-def _copy_rows(database: sqlite3.Connection, sink: McapSink, budget: Budget) -> None:
+def _copy_rows(database: sqlite3.Connection, sink: McapSink, budget: Budget) -> int:
+    """Copy the rows that can be read; returns how many between them cannot."""
     budget.start_pass()
     database.execute("PRAGMA writable_schema=ON")  # or SQLite refuses a file that is shorter than its header says
     database.text_factory = lambda raw: raw.decode(errors="replace")
@@ -216,7 +266,7 @@ def _copy_rows(database: sqlite3.Connection, sink: McapSink, budget: Budget) -> 
     ):
         encoding, text = definitions.get(str(kind), ("", ""))
         ids[topic_id] = sink.channel(str(name), str(kind), encoding, text.encode(), str(serialization))
-    last, step = 0, 1
+    last, step, skipped = 0, 1, 0
     while step < 2**40:  # past a damaged page the next sound row is looked for further and further away
         try:
             rows = database.execute(
@@ -224,39 +274,45 @@ def _copy_rows(database: sqlite3.Connection, sink: McapSink, budget: Budget) -> 
             )
             for row_id, topic_id, received_ns, data in rows:
                 if row_id <= last:
-                    return  # a damaged tree that leads in circles
+                    return skipped  # a damaged tree that leads in circles
+                skipped += row_id - last - 1 if step > 1 else 0
                 last, step = row_id, 1
                 if topic_id in ids and isinstance(received_ns, int) and isinstance(data, bytes):
                     budget.spend(len(data))
                     sink.write(ids[topic_id], received_ns, data)
-            return
+            return skipped
         except sqlite3.DatabaseError:
             step *= 2
+    return skipped
 
 
 # --- ROS 1 bags -------------------------------------------------------------------------------------------------------
 
 
-def recover_ros1(path: Path, target: Path) -> tuple[int, float]:
-    """Copy what can be read of a ROS 1 bag; returns the number of messages and the share of the bytes that is lost.
+def recover_ros1(path: Path, target: Path) -> Recovered:
+    """Copy what can be read of a ROS 1 bag.
 
     Raises:
         TooLargeError: its chunks expand to more than its size allows.
     """
     budget = Budget(path)
     budget.start_pass()
-    size = path.stat().st_size
-    read = messages = 0
+    walk = _Walk(path)
+    messages = 0
     connections: dict[int, Connection] = {}
     known: dict[tuple[str, str], Connection] = {}
     with Writer(target) as writer, path.open("rb") as file:
-        read += len(file.readline(64))  # magic
-        for header, data, sound in _ros1_records(file, size):
+        walk.sound += len(file.readline(64))  # magic
+        for header, data, sound in _ros1_records(file, walk.size):
+            if header.get("op") == b"\x03" and len(header.get("index_pos", b"")) == 8:
+                index_at = struct.unpack("<Q", header["index_pos"])[0]
+                walk.extends_to(index_at)
+                walk.cut = not 0 < index_at <= walk.size
             if header.get("op") == b"\x05":
                 inner, sound = _ros1_chunk(header, data, sound, budget)
             else:
                 inner = [(header, data)] if sound else []
-            read += 8 + sum(5 + len(k) + len(v) for k, v in header.items()) + len(data) if sound else 0
+            walk.sound += 8 + sum(5 + len(k) + len(v) for k, v in header.items()) + len(data) if sound else 0
             for record, content in inner:
                 try:
                     if record["op"] == b"\x07":
@@ -270,7 +326,7 @@ def recover_ros1(path: Path, target: Path) -> tuple[int, float]:
                         messages += 1
                 except (KeyError, struct.error, UnicodeDecodeError):
                     continue  # a damaged record, or one of a connection that was lost
-    return messages, max(0.0, 1.0 - read / size)
+    return Recovered(target, messages, walk.lost, walk.cut)
 
 
 def _ros1_connection(
@@ -333,15 +389,6 @@ def _ros1_chunk(
 _RECOVER = {"ros1": recover_ros1, "mcap": recover_mcap, "sqlite3": recover_sqlite}
 
 
-@dataclass(frozen=True, slots=True)
-class Recovered:
-    """A sound file that holds what could be read of a damaged one."""
-
-    path: Path
-    messages: int
-    lost: float  # share of the damaged file's bytes that could not be read, or are known to be missing
-
-
 def recover(path: Path, kind: str, folder: Path) -> Recovered:
     """Copy what can be read of ``path`` into a new file in ``folder``.
 
@@ -357,5 +404,4 @@ def recover(path: Path, kind: str, folder: Path) -> Recovered:
     target.unlink(missing_ok=True)
     if path.stat().st_size == 0:
         return Recovered(target, 0, 1.0)
-    messages, lost = _RECOVER[kind](path, target)
-    return Recovered(target, messages, lost)
+    return _RECOVER[kind](path, target)

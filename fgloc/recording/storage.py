@@ -28,8 +28,8 @@ from fgloc.recording.limits import (
     decompressed,
     opening,
 )
-from fgloc.recording.recover import recover, sqlite_journals
-from fgloc.types import Grave
+from fgloc.recording.recover import Recovered, recover, sqlite_journals
+from fgloc.types import Grave, Lost
 
 # --- metadata.yaml of a rosbag2 folder; hostile contents are refused --------------------------------------------------
 
@@ -101,9 +101,13 @@ _MAGIC = {
     b"SQLite format 3\0": (".db3", "SQLite"),
 }
 _MOST_NAMED = 5
-_WHOLE = 0.005  # share of a file's bytes: where so few are lost, it was cut off, or only its index is damaged
-_CUT = "; if it was cut off, what came after is missing"
+_LITTLE = 0.01  # share of a recording whose loss is worth no warning
 EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
+
+
+def lost(text: str, share: float) -> str:
+    """The note that a share of a recording cannot be read, grave if it is more than a little."""
+    return Lost(text, min(share, 1.0)) if share > _LITTLE else text
 
 
 def find_beside(bag: Path, name: str) -> Path | None:
@@ -129,14 +133,14 @@ def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[
         kind_of(path)
         if not path.is_file():
             raise RecordingError(f"{path}: not a regular file; {EXPECTED}")
-        return None, (path,)
+        return _metadata_of(path), (path,)
     metadata = read_metadata(path)
     if metadata is not None:
         present = tuple(file for file in metadata.files if file.is_file())
         if present:
             missing = [file.name for file in metadata.files if file not in present]
             if missing:
-                notes.append(f"Named by metadata.yaml but missing: {', '.join(missing)}.")
+                notes.append(Grave(f"Named by metadata.yaml but missing: {', '.join(missing)}."))
             return metadata, present
     groups: dict[str, list[Path]] = defaultdict(list)
     for file in sorted(path.iterdir(), key=_natural):
@@ -154,6 +158,15 @@ def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[
     damaged = (path / "metadata.yaml").exists()
     notes.append(Grave(f"metadata.yaml is damaged: {opened}") if damaged else f"metadata.yaml is missing: {opened}")
     return None, tuple(files)
+
+
+def _metadata_of(file: Path) -> BagMetadata | None:
+    """Content of the ``metadata.yaml`` beside a storage file, if it is of this file alone."""
+    try:
+        metadata = read_metadata(file.parent)
+    except RecordingError:  # the file is sound whatever lies beside it
+        return None
+    return metadata if metadata is not None and [f.name for f in metadata.files] == [file.name] else None
 
 
 def _recordings_in(folder: Path) -> list[str]:
@@ -253,7 +266,7 @@ class Storage:
                 failures.append(str(error))
         if not self._files:
             raise RecordingError("\n".join(failures))
-        self.notes.extend(failures)
+        self.notes.extend(map(Grave, failures))
 
     def _decompressed(self, file: Path) -> Path:
         """A copy of a file that the recorder compressed as a whole; of a damaged one, as far as it goes."""
@@ -267,9 +280,9 @@ class Storage:
     def _compare_count(self, expected: int) -> None:
         found = sum(channel.count for channel in self.channels)
         if found < expected:
-            self.notes.append(
-                f"metadata.yaml counts {expected} messages, the files hold {found}: {1 - found / expected:.1%} lost."
-            )
+            share = 1.0 - found / expected
+            text = f"metadata.yaml counts {expected} messages, the files hold {found}: {share:.1%} lost."
+            self.notes.append(lost(text, share))
 
     def close(self) -> None:
         """Close all files and delete scratch copies."""
@@ -414,15 +427,28 @@ class _File:
             raise RecordingError(
                 f"{self._path}: cannot be read: {reason}; {EXPECTED}, and no message could be salvaged."
             ) from error
+        stated = 0 if self.reader is None else self.reader.message_count
         self._recovered = True
         self.close()
         self.reader = reader
-        lost = f"{recovered.lost:.1%} of its bytes are lost{_CUT if recovered.lost < _WHOLE else ''}"
-        self._note(Grave(f"{self._path.name} is damaged ({reason}): salvaged {recovered.messages} messages, {lost}."))
+        self._note(_salvaged(f"{self._path.name} is damaged ({reason})", recovered, stated))
 
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
+
+
+def _salvaged(damage: str, recovered: Recovered, stated: int) -> Grave:
+    """Note on a salvaged file: its share that is lost, by its index (``stated`` messages; 0: none) or else its bytes."""
+    share, told = recovered.lost, f"salvaged {recovered.messages} messages"
+    if stated > recovered.messages:
+        share = 1.0 - recovered.messages / stated
+        told = f"salvaged {recovered.messages} of {stated} messages, {share:.1%} are lost"
+    elif share >= 0.0005:
+        told += f", {share:.1%} of its bytes are lost"
+    if recovered.cut:
+        told += "; it ends before its index: if it was cut off, what came after is missing too"
+    return Lost(f"{damage}: {told}.", share) if share > _LITTLE else Grave(f"{damage}: {told}.")
 
 
 def _open(path: Path, kind: str, budget: Budget) -> Any:

@@ -15,13 +15,14 @@ from recording_bags import START_NS, TICK_NS, storage_file, write_drive, write_r
 from refusal import refusal
 from rosbags.rosbag2 import Reader
 
+import fgloc
 from fgloc.config import RecordingConfig
 from fgloc.errors import RecordingError
 from fgloc.files.documents import HostileError
 from fgloc.recording.reader import open_recording
 from fgloc.recording.recover import recover_mcap
 from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import Grave
+from fgloc.types import Grave, Lost, Severity
 
 DEFAULT = RecordingConfig()
 
@@ -40,7 +41,7 @@ def note_of(notes: tuple[str, ...], word: str) -> str:
 
 def lost_share(note: str) -> float:
     assert isinstance(note, Grave)
-    return float(re.search(r"([\d.]+)% of its bytes are lost", note).group(1)) / 100
+    return note.share if isinstance(note, Lost) else 0.0
 
 
 def small_chunks(path: Path, chunk_bytes: int = 8192) -> Path:
@@ -80,8 +81,10 @@ def test_fault_60_a_compressed_chunk_that_is_cut_short_gives_its_beginning(tmp_p
         for k in range(2000):
             writer.add_message(channel, k, rng.bytes(300), k)
         writer.finish()
-    found, _ = recover_mcap(cut(path, 0.5), tmp_path / "salvaged.mcap")
-    assert 500 < found < 1200
+    recovered = recover_mcap(cut(path, 0.5), tmp_path / "salvaged.mcap")
+    assert 500 < recovered.messages < 1200
+    assert recovered.lost == pytest.approx(0.5, abs=0.05)  # the chunk says how long it was
+    assert recovered.cut
 
 
 @pytest.mark.parametrize("chunk_bytes", [None, 8192])
@@ -91,22 +94,55 @@ def test_fault_60_truncated_mcap_is_salvaged(tmp_path, chunk_bytes):
     received, notes = odometry_stamps(path)
     assert received == [START_NS + k * TICK_NS + 2_000_000 for k in range(len(received))]
     assert 0.4 * 200 < len(received) < 0.8 * 200
-    assert 0.0 <= lost_share(note_of(notes, "salvaged")) < 0.1
+    by_its_chunk = 0.4 if chunk_bytes is None else 0.0  # of small chunks those that are missing are not known
+    assert lost_share(note_of(notes, "salvaged")) == pytest.approx(by_its_chunk, abs=0.1)
 
 
-def test_fault_60_truncation_in_a_folder_is_told_in_messages(tmp_path):
+@pytest.mark.parametrize("opened", ["folder", "file"])
+def test_fault_60_truncation_is_told_by_the_messages_that_metadata_counts(tmp_path, opened):
     folder = write_drive(tmp_path / "run")
-    cut(storage_file(folder), 0.5)
-    _, notes = odometry_stamps(folder)
-    share = float(re.search(r"([\d.]+)% lost", note_of(notes, "metadata.yaml counts 842 messages")).group(1))
-    assert 30 < share < 70
+    file = cut(storage_file(folder), 0.5)
+    _, notes = odometry_stamps(folder if opened == "folder" else file)
+    assert 0.3 < lost_share(note_of(notes, "metadata.yaml counts 842 messages")) < 0.7
+
+
+def test_fault_60_a_missing_file_of_several_is_grave(tmp_path):
+    folder = write_drive(tmp_path / "run")
+    metadata, name = folder / "metadata.yaml", storage_file(folder).name
+    metadata.write_text(metadata.read_text().replace(f"- {name}", f"- {name}\n  - second.mcap", 1))
+    assert isinstance(note_of(odometry_stamps(folder)[1], "missing: second.mcap"), Grave)
+
+
+@pytest.mark.parametrize("share, grave", [(0.5, True), (0.005, False)])
+def test_fault_60_messages_that_cannot_be_decoded_are_told_by_their_share(tmp_path, share, grave):
+    """A run warns of a large loss, and counts a single bad message."""
+    file = storage_file(write_drive(tmp_path / "run", "sqlite3"))
+    with closing(sqlite3.connect(file)) as database:
+        (topic,) = database.execute("SELECT id FROM topics WHERE name = '/odom'").fetchone()
+        chosen = f"SELECT id FROM messages WHERE topic_id = {topic} ORDER BY id LIMIT {int(200 * share)}"
+        database.execute(f"UPDATE messages SET data = x'00010000' WHERE id IN ({chosen})")
+        database.commit()
+    with open_recording(file, DEFAULT) as recording:
+        sum(1 for _ in recording.events())
+        (said,) = recording.unreadable
+    assert isinstance(said, Grave) == grave
+    assert not grave or lost_share(said) == share
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_fault_60_a_run_warns_of_half_a_recording_lost(tmp_path, kind):
+    path = storage_file(write_drive(tmp_path / "run")) if kind == "mcap" else write_ros1(tmp_path / "run.bag")
+    result = fgloc.run(cut(path, 0.5), None, fgloc.Config(), "online")
+    lost = [finding for finding in result.findings if finding.code == "recording.lost"]
+    assert lost and all(finding.severity is Severity.WARNING for finding in lost)
+    assert 0.3 < max(finding.value for finding in lost) < 0.7
 
 
 def test_fault_60_truncated_ros1_bag_is_salvaged(tmp_path):
     received, notes = odometry_stamps(cut(write_ros1(tmp_path / "run.bag"), 0.5))
     assert received == [START_NS + k * TICK_NS for k in range(len(received))]
     assert 30 < len(received) < 70
-    assert lost_share(note_of(notes, "salvaged")) < 0.1
+    assert lost_share(note_of(notes, "salvaged")) == pytest.approx(0.5, abs=0.1)  # its head has the place of its index
 
 
 def test_fault_60_truncated_sqlite_is_salvaged(tmp_path):
@@ -262,7 +298,7 @@ def test_fault_63_what_was_read_before_the_damage_is_kept(tmp_path):
     lost = set(all_stamps) - set(received)
     assert lost
     assert all(bounds[0] <= stamp <= bounds[1] for stamp in lost)
-    assert 0 < lost_share(note_of(notes, "salvaged")) < 0.2
+    assert 0 < lost_share(note_of(notes, "of 842 messages")) < 0.2  # its index counts them
 
 
 def test_fault_63_damaged_text_in_definitions_falls_back(tmp_path):
