@@ -117,9 +117,14 @@ def spare_inputs(
     from fgloc.recording.storage import find_beside
 
     written = {(out / name).resolve() for name in _RESULTS} if folder else {out.resolve()}
-    for given in (map_file or find_beside(bag, "map.yaml"), config or find_beside(bag, "robot.yaml")):
+    kept = [map_file or find_beside(bag, "map.yaml"), config or find_beside(bag, "robot.yaml")]
+    if folder:  # nobody asked for a file of this name
+        kept.append(find_beside(bag, "map.yaml"))
+    for given in kept:
         if given is not None and given.resolve() in written and not force:
-            raise OutputError(f"--out {out}: {given} is read and would be written over; give another --out, or --force")
+            raise OutputError(
+                f"--out {out}: {given} is an input and would be written over; give another --out, or --force"
+            )
 
 
 # --- Extras -----------------------------------------------------------------------------------------------------------

@@ -189,14 +189,17 @@ def shown_path(path: Path) -> str:
 
 def say_inputs(bag: Path, map_file: Path | None, config_file: Path | None, without_map: str = _MAPPED) -> None:
     """Print which map and configuration are read, also where they were not asked for."""
-    from fgloc.recording.storage import find_beside
+    from fgloc.recording.storage import find_beside, passed_over
 
-    for given, file, name, without in (
-        (map_file, "map.yaml", "map", without_map),
-        (config_file, "robot.yaml", "configuration", "defaults"),
+    for given, file, option, name, without in (
+        (map_file, "map.yaml", "map", "map", without_map),
+        (config_file, "robot.yaml", "config", "configuration", "defaults"),
     ):
         found = given or find_beside(bag, file)
         say(f"{name}: {without if found is None else found}{'' if given or not found else ' (beside the recording)'}")
+        result = None if given else passed_over(bag, file)
+        if result is not None:
+            say(f"note: {result} is what a run found, and not read; give --{option} {shown_path(result)} to use it")
 
 
 def say_table(head: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:

@@ -30,6 +30,7 @@ from fgloc.evaluation.style import FORMATS, Format, image_of, png
 from fgloc.files.atomic import atomic_folder
 from fgloc.files.outputs import (
     RESULT_FORMAT,
+    RESULT_MARK,
     write_bytes,
     write_covariance_csv,
     write_json,
@@ -352,7 +353,7 @@ def write_results(
         if result.found is not None and result.found.names:
             write_text(stage / "installation.yaml", installation_yaml(result.found, config, out, command))
             if result.found.landmarks is not None:
-                write_map(result.found.landmarks, stage / "map.yaml")
+                write_map(result.found.landmarks, stage / "map.yaml", (RESULT_MARK,))
         write_text(stage / "report.html", render(result, metrics, matched, images, provenance))
     return metrics
 

@@ -45,6 +45,21 @@ _STEP_COLUMNS = (
 RESULT_FORMAT = 1
 """Version of result folders, in ``config.json``; 0: none is written there, before 1.0."""
 
+RESULT_MARK = "# As a run of fgloc found it. Beside the run's result, other runs read it only if they are given it."
+"""First line of a file that a run writes under a name which the next one looks for beside its recording."""
+
+
+def is_result(file: Path) -> bool:
+    """Whether a run wrote this file with its result, which still lies beside it."""
+    if not (file.parent / "trajectory.tum").is_file():
+        return False
+    mark = RESULT_MARK.encode()
+    try:
+        with file.open("rb") as opened:
+            return opened.read(len(mark)) == mark
+    except OSError:
+        return False
+
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as TUM: ``t x y z qx qy qz qw``, t in seconds with all nine decimals.

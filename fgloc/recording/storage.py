@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Reader as Ros2Reader
 
 from fgloc.errors import RecordingError
 from fgloc.files.documents import HostileError, parse, plain
+from fgloc.files.outputs import is_result
 from fgloc.recording.limits import (
     REWINDS,
     Budget,
@@ -111,9 +112,23 @@ def lost(text: str, share: float) -> str:
 
 
 def find_beside(bag: Path, name: str) -> Path | None:
-    """A file of this name beside the bag: in its folder, or in the folder that holds it."""
+    """A file of this name beside the bag: in its folder, or in the folder that holds it.
+
+    A file that a run wrote there with its result is passed over: what a run finds is the input of another one only
+    where a user says so, by giving it or by copying it out of the result.
+    """
+    return next((file for file in _beside(bag, name) if not is_result(file)), None)
+
+
+def passed_over(bag: Path, name: str) -> Path | None:
+    """The file that `find_beside` would return if no run had written it."""
+    first = next(_beside(bag, name), None)
+    return first if first is not None and is_result(first) else None
+
+
+def _beside(bag: Path, name: str) -> Iterator[Path]:
     folders = (bag, bag.parent) if bag.is_dir() else (bag.parent, bag.parent.parent)
-    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+    return (folder / name for folder in folders if (folder / name).is_file())
 
 
 def beside(bag: Path, name: str) -> Path:
@@ -439,7 +454,7 @@ class _File:
 
 
 def _salvaged(damage: str, recovered: Recovered, stated: int) -> Grave:
-    """Note on a salvaged file: its share that is lost, by its index (``stated`` messages; 0: none) or else its bytes."""
+    """Note on a salvaged file: the share that is lost, by the ``stated`` messages of its index, else by its bytes."""
     share, told = recovered.lost, f"salvaged {recovered.messages} messages"
     if stated > recovered.messages:
         share = 1.0 - recovered.messages / stated

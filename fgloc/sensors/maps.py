@@ -24,7 +24,7 @@ A rigid board of markers is one entry, placed as a marker is; its markers are di
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -247,8 +247,8 @@ def configured_map(path: Path, config: Config, default_size_m: float | None = No
     return load_map(path, size, config.map.scale, config.map.size_scale)
 
 
-def write_map(landmark_map: LandmarkMap, path: Path) -> None:
-    """Write our format, whole or not at all; boards as bundles.
+def write_map(landmark_map: LandmarkMap, path: Path, head: Sequence[str] = ()) -> None:
+    """Write our format after comment lines, whole or not at all; boards as bundles.
 
     Reading it gives the same map to the last bit but for rotations and boards (1e-15).
 
@@ -257,7 +257,7 @@ def write_map(landmark_map: LandmarkMap, path: Path) -> None:
     """
     from scipy.spatial.transform import Rotation  # takes a fifth of a second to load, and reading needs none
 
-    lines = [f"dictionary: {landmark_map.dictionary}"] if landmark_map.dictionary else []
+    lines = [*head, *([f"dictionary: {landmark_map.dictionary}"] if landmark_map.dictionary else [])]
     on: dict[int, list[Landmark]] = {}
     alone: list[Landmark] = []
     for _, landmark in sorted(landmark_map.landmarks.items()):

@@ -113,7 +113,7 @@ def test_fault_60_a_missing_file_of_several_is_grave(tmp_path):
     assert isinstance(note_of(odometry_stamps(folder)[1], "missing: second.mcap"), Grave)
 
 
-@pytest.mark.parametrize("share, grave", [(0.5, True), (0.005, False)])
+@pytest.mark.parametrize(("share", "grave"), [(0.5, True), (0.005, False)])
 def test_fault_60_messages_that_cannot_be_decoded_are_told_by_their_share(tmp_path, share, grave):
     """A run warns of a large loss, and counts a single bad message."""
     file = storage_file(write_drive(tmp_path / "run", "sqlite3"))
@@ -134,7 +134,8 @@ def test_fault_60_a_run_warns_of_half_a_recording_lost(tmp_path, kind):
     path = storage_file(write_drive(tmp_path / "run")) if kind == "mcap" else write_ros1(tmp_path / "run.bag")
     result = fgloc.run(cut(path, 0.5), None, fgloc.Config(), "online")
     lost = [finding for finding in result.findings if finding.code == "recording.lost"]
-    assert lost and all(finding.severity is Severity.WARNING for finding in lost)
+    assert lost
+    assert all(finding.severity is Severity.WARNING for finding in lost)
     assert 0.3 < max(finding.value for finding in lost) < 0.7
 
 
