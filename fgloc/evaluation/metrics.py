@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
 from fgloc.calibration.installation import constants_found
-from fgloc.config import Config, base_role
+from fgloc.config import Config, base_role, camera_role
 from fgloc.diagnosis.pairs import MAD
 from fgloc.diagnosis.truth import truth_sentence
 from fgloc.errors import CovarianceError, TrajectoryError
@@ -206,7 +206,6 @@ _SETTINGS = {  # of a sensor whose messages are dropped
     "command": "expert.gate.max_speed, expert.gate.max_yaw_rate",
     "imu": "expert.gate.max_yaw_rate or recording.received_stamps",
     "image": "camera.file, recording.topics.image",
-    "sightings": "markers.sigma_px, map.position_sigma_m, expert.gate.max_range",
 }
 
 _MOTION = ("odometry", "joints", "command")  # of which one is used
@@ -354,21 +353,19 @@ def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
 
 def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> Iterator[Finding]:
     dropped: Counter[str] = Counter()
-    for reason, count in rejections.items():
-        if not reason.endswith(".frozen"):  # has its own warning
-            dropped[reason.partition(".")[0]] += count
+    told = {reason: n for reason, n in rejections.items() if not reason.endswith(".frozen")}  # has its own warning
+    for reason, count in told.items():
+        dropped[reason.partition(".")[0]] += count
     most = max((topic.count for topic in result.spans.values()), default=0)
     for sensor, count in dropped.most_common():
-        if (kind := base_role(sensor)) not in _SETTINGS:
+        if (kind := base_role(sensor)) not in (*_SETTINGS, "sightings"):
             continue
         received = keyframes if kind in ("image", "sightings") else most
         if count >= _FEWEST and count > _MOST_DROPPED * max(received, count):
-            reasons = ", ".join(
-                f"{r} {n}" for r, n in rejections.items() if r.startswith(f"{sensor}.") and not r.endswith(".frozen")
-            )
+            reasons = ", ".join(f"{r} {n}" for r, n in told.items() if r.startswith(f"{sensor}."))
             too_fast = rejections.get("joints.wheel_rate_bound", 0) if sensor == "joints" else 0
             used = sensor not in _MOTION or result.found is None or result.found.wheels in ("", sensor)
-            remedy = f"look at {_SETTINGS[kind]}" if used else "the run's motion is of another source"
+            remedy = f"look at {_settings_of(sensor, result)}" if used else "the run's motion is of another source"
             text = f"{count} messages of {sensor} were dropped ({reasons}); {remedy}."
             if 2 * too_fast > count:
                 text = (
@@ -377,6 +374,18 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
                     "wheels.drive with its ticks_per_turn (docs/drives.md); else record velocities in rad/s."
                 )
             yield Finding(f"{sensor}.dropped", text, Severity.WARNING if used else Severity.NOTE, value=float(count))
+
+
+def _settings_of(sensor: str, result: RunData) -> str:
+    """Settings that decide which messages of a sensor are dropped; of sightings, by what this run's are."""
+    kind = base_role(sensor)
+    if kind != "sightings":
+        return _SETTINGS[kind]
+    found = result.found
+    corners = found is not None and any(camera_role(c.name, kind) == sensor for c in found.cameras)
+    noise = ["markers.sigma_px"] if corners else ["landmarks.range_sigma_m", "landmarks.bearing_sigma_rad"]
+    places = ["map.position_sigma_m"] if found is not None and found.landmarks is not None else []
+    return ", ".join([*noise, *places, "expert.gate.max_range"])
 
 
 def _prior_sigmas(result: RunData) -> str:
