@@ -11,19 +11,36 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fgloc import se2
-from fgloc.errors import TrajectoryError
+from fgloc.errors import FglocError, TrajectoryError
 
 MAX_LANDMARK_ID = 2**31 - 1  # int32 of the messages; the graph's keys have room for 56 bits
 
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+WHOLE_NS = "expected a whole number of nanoseconds: of seconds, give round(seconds * 1e9)"
+
+
+def whole_ns(stamp: Any, error: type[FglocError]) -> int:
+    """Time [ns] as an integer.
+
+    Raises:
+        FglocError: of the given class: it is not a whole number, as a time in seconds.
+    """
+    try:
+        whole = int(stamp)
+        if whole == stamp:
+            return whole
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise error(f"stamp {stamp!r}; {WHOLE_NS}")
 
 
 # --- Events: one message (or one transform of one) as recorded, before validation -------------------------------------

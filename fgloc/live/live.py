@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+import reprlib
 import threading
 import time
 from collections import Counter
@@ -27,7 +30,99 @@ from fgloc.sensors import registry
 from fgloc.sensors.base import SENSOR, When
 from fgloc.sensors.learned.sensor import learned_motion
 from fgloc.sensors.maps import configured_map
-from fgloc.types import Camera, CameraInfoEvent, Estimate, Event, FloatArray, LandmarkMap, MotionEvent, TransformEvent
+from fgloc.types import (
+    WHOLE_NS,
+    Camera,
+    CameraInfoEvent,
+    Estimate,
+    Event,
+    FloatArray,
+    LandmarkMap,
+    MotionEvent,
+    TransformEvent,
+    whole_ns,
+)
+
+# --- Arguments as a caller gives them ---------------------------------------------------------------------------------
+
+_SHAPES: Mapping[str, tuple[tuple[int | None, ...], str]] = {
+    "pose": ((3,), "x, y [m] and yaw [rad]"),
+    "sigmas": ((3,), "sigmas of x, y [m] and yaw [rad]"),
+    "twist": ((3,), "forward, left [m/s] and yaw rate [rad/s]"),
+    "twist_cov": ((3, 3), "covariance of forward, left [m/s] and yaw rate [rad/s]"),
+    "v": ((), "forward speed [m/s]"),
+    "omega": ((), "yaw rate [rad/s]"),
+    "angular_velocity": ((3,), "rates about x, y and z [rad/s]"),
+    "linear_acceleration": ((3,), "accelerations along x, y and z [m/s²]"),
+    "position": ((None,), "angles of the joints [rad]"),
+    "velocity": ((None,), "rates of the joints [rad/s]"),
+    "effort": ((None,), "torques of the joints [Nm]"),
+    "landmarks": ((None, 3), "id, range [m] and bearing [rad] of each landmark"),
+    "markers": ((4, 2), "corners [px], clockwise from its top left, by id of each marker"),
+    "image": ((None, None), "a uint8 array (h, w) or (h, w, 3), or the bytes of a JPEG or PNG"),
+    "K": ((3, 3), "camera matrix [px]"),
+    "D": ((None,), "coefficients of the distortion"),
+    "translation": ((3,), "x, y and z [m]"),
+    "rotation": ((4,), "quaternion x, y, z, w"),
+}
+"""Shape (None: any length) and meaning of each argument of the methods that make events."""
+
+
+def _numbers(name: str, value: Any, where: str) -> FloatArray:
+    """An argument as numbers of its shape.
+
+    Raises:
+        EstimatorError: it is none; the message has the value and what was expected.
+    """
+    shape, meaning = _SHAPES[name]
+    try:
+        array: FloatArray = np.asarray(value, dtype=float)
+        if any(part is None for part in np.asarray(value, dtype=object).ravel()):  # which numpy takes for NaN
+            raise TypeError("None is no number")
+    except (TypeError, ValueError):
+        array = np.empty((0,) * (len(shape) + 1))
+    fits = len(array.shape) == len(shape) and all(s is None or n == s for n, s in zip(array.shape, shape, strict=True))
+    if not fits:
+        size = " x ".join("n" if n is None else str(n) for n in shape) or "1"
+        numbers = "1 number" if size == "1" else f"{size} numbers"
+        raise EstimatorError(f"{where}: {name} is {reprlib.repr(value)}; expected {numbers}: {meaning}")
+    return array
+
+
+def _wrong_argument(method: Callable[..., Any], given: Mapping[str, Any]) -> None:
+    """Raise the error that names the first argument which is not of its shape, if there is one."""
+    for name, value in given.items():
+        if name not in _SHAPES or (value is None and name in ("pose", "twist", "twist_cov")):
+            continue
+        if name == "markers" and isinstance(value, Mapping):
+            for corners in value.values():
+                _numbers(name, corners, method.__name__)
+        elif name == "image":
+            raise EstimatorError(f"{method.__name__}: image is {reprlib.repr(value)}; expected {_SHAPES[name][1]}")
+        else:
+            _numbers(name, value, method.__name__)
+
+
+def _explained(method: Callable[..., Any]) -> Callable[..., Any]:
+    """The method that makes events of plain numbers, with an error that names the argument it cannot use."""
+    signature = inspect.signature(method)
+
+    @functools.wraps(method)
+    def called(self: Live, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(self, *args, **kwargs)
+        except (AttributeError, IndexError, TypeError, ValueError) as error:
+            try:
+                given = signature.bind(self, *args, **kwargs).arguments
+            except TypeError:
+                raise error from None  # of a call that Python itself refuses
+            _wrong_argument(method, given)
+            raise EstimatorError(
+                f"{method.__name__}: {error}; expected values as help(fgloc.Live.{method.__name__}) has them"
+            ) from error
+
+    return called
+
 
 # --- Reception: rates and delays by topic, publishers, and clocks that were reset -------------------------------------
 
@@ -254,9 +349,16 @@ class Live(registry.SensorInput):
             nothing if it is of a second publisher, or held back for a moment because its clock may have been reset.
 
         Raises:
-            EstimatorError: `close` was called.
+            EstimatorError: `close` was called, or it is no event, or one whose stamps are no whole nanoseconds.
             FglocError: the run has failed: what it was fed cannot be used.
         """
+        if not isinstance(event, Event):
+            raise EstimatorError(
+                f"push: {reprlib.repr(event)}; expected an event of fgloc, as its methods odometry, imu, ... make it"
+            )
+        for stamp in (event.stamp_ns, event.received_ns):
+            if not isinstance(stamp, int | np.integer):
+                raise EstimatorError(f"push: {type(event).__name__} has stamp {stamp!r}; {WHOLE_NS}")
         with self._lock:
             used = self._reception.receive(event, publisher)
             for received in used:
@@ -274,8 +376,8 @@ class Live(registry.SensorInput):
         Raises:
             EstimatorError: values that are none, or the run is closed.
         """
-        mean, spread = np.asarray(pose, dtype=float), np.asarray(sigmas, dtype=float)
-        if not (mean.shape == spread.shape == (3,) and np.isfinite([mean, spread]).all() and (spread > 0.0).all()):
+        mean, spread = _numbers("pose", pose, "reset_pose"), _numbers("sigmas", sigmas, "reset_pose")
+        if not (np.isfinite([mean, spread]).all() and (spread > 0.0).all()):
             raise EstimatorError(f"pose {pose} with sigmas {sigmas}; expected three finite values and sigmas above 0")
         self._estimation.reset_pose(PoseWithCovariance(mean, np.diag(spread**2)))
 
@@ -333,21 +435,21 @@ class Live(registry.SensorInput):
     ) -> None:
         """Push the camera's calibration, once: K ``(3, 3)`` and D ``(n,)``; see `fgloc.types.Camera` for the models."""
         now = time.time_ns()
-        arrays: tuple[Any, Any] = np.asarray(K, dtype=float).reshape(3, 3), np.asarray(D, dtype=float).ravel()
+        square = np.reshape(K, (3, 3)) if np.size(K) == 9 else K
+        arrays = _numbers("K", square, "camera_info"), _numbers("D", np.ravel(D), "camera_info")
         topic = self._recording.topics.camera_info or "camera_info"
         self._deliver(CameraInfoEvent(now, now, topic, frame_id, width, height, model, *arrays))
 
     def transform(self, parent: str, child: str, translation: ArrayLike, rotation: ArrayLike) -> None:
         """Push a fixed transform ``T_parent_child``: translation ``(3,)`` [m] and quaternion ``(4,)`` x, y, z, w."""
         now = time.time_ns()
-        t: FloatArray = np.asarray(translation, dtype=float)
-        q: FloatArray = np.asarray(rotation, dtype=float)
+        t, q = _numbers("translation", translation, "transform"), _numbers("rotation", rotation, "transform")
         self._deliver(TransformEvent(now, now, "/tf_static", parent, child, t, q, True))
 
     def _when(self, role: Role, stamp_ns: int) -> When:
         """Stamp as the configuration corrects it, receive time and topic."""
         received = time.time_ns()
-        stamp = received if role in self._recording.received_stamps else int(stamp_ns)
+        stamp = received if role in self._recording.received_stamps else whole_ns(stamp_ns, EstimatorError)
         given = self._beside.get(role) or self._recording.topics.given(role)
         return stamp + round(self._recording.stamp_offset_s.get(role, 0.0) * 1e9), received, given or role
 
@@ -366,10 +468,11 @@ class Live(registry.SensorInput):
             None while no pose is known, or for a time of which nothing is known.
 
         Raises:
+            EstimatorError: the time is no whole number of nanoseconds.
             FglocError: the run has failed.
         """
         self._estimation.check_failed()
-        return self._results.poses.pose_at(stamp_ns)
+        return self._results.poses.pose_at(None if stamp_ns is None else whole_ns(stamp_ns, EstimatorError))
 
     def status(self) -> LiveStatus:
         """State of the run."""
@@ -405,6 +508,11 @@ class Live(registry.SensorInput):
             OutputError: the state cannot be written.
         """
         self._estimation.close()
+
+
+for _name, _method in inspect.getmembers(registry.SensorInput, inspect.isfunction):
+    if not _name.startswith("_"):
+        setattr(Live, _name, _explained(_method))
 
 
 def _begun(process: bool | EstimationProcess, settings: Settings, results: _Results) -> Estimation | EstimationProcess:
