@@ -573,11 +573,77 @@ class Trajectory:
             ``(3,)`` for one time, else ``(m, 3)``.
 
         Raises:
-            TrajectoryError: the trajectory is empty, or a time lies outside it.
+            TrajectoryError: the trajectory is empty, or a time lies outside it or is no whole number.
+        """
+        poses = se2.interpolate(self.stamps_ns, self.poses, self._inside(stamp_ns))
+        return poses[0] if np.ndim(stamp_ns) == 0 else poses
+
+    def interpolate_covs(self, stamp_ns: int | IntArray) -> FloatArray:
+        """Covariances of the poses that `interpolate` gives, in the map frame.
+
+        Between two poses with covariances P and Q, at the share s of the h seconds between them:
+
+            (1 - s) P + s Q + (s (1 - s) h² / 2)² diag(A, A, W)
+
+        The first two terms are no less than the covariance of the interpolated errors, however the two are correlated.
+        The third is for the way between, which need not be straight nor of one speed, nor bend to a known side: A and W
+        are the sums of the squared accelerations of position [m²/s⁴] and yaw [rad²/s⁴] at the two poses, by the mean
+        velocities before and after each. A pose at either end of the trajectory has none; two poses alone are taken for
+        a start from rest. A jolt that begins and ends between two poses is not seen: `fgloc.Live.pose_at` knows the
+        motion there.
+
+        Args:
+            stamp_ns: as for `interpolate`.
+
+        Returns:
+            ``(3, 3)`` for one time, else ``(m, 3, 3)``; at a known pose its own covariance.
+
+        Raises:
+            TrajectoryError: as for `interpolate`, or there are no covariances.
+        """
+        asked = self._inside(stamp_ns)
+        if self.covs is None:
+            raise TrajectoryError(
+                "the trajectory has no covariances, as that of a truth; `interpolate` gives its poses"
+            )
+        if len(self) == 1:
+            covs = np.repeat(self.covs, len(asked), axis=0)
+        else:
+            k = np.clip(np.searchsorted(self.stamps_ns, asked, "right") - 1, 0, len(self) - 2)
+            h = (self.stamps_ns[k + 1] - self.stamps_ns[k]) * 1e-9
+            s = ((asked - self.stamps_ns[k]) * 1e-9 / h)[:, None, None]
+            squared = self._squared_accelerations()
+            covs = (1.0 - s) * self.covs[k] + s * self.covs[k + 1]
+            bend = 0.5 * s[:, 0] * (1.0 - s[:, 0]) * h[:, None] ** 2
+            covs[:, range(3), range(3)] += bend**2 * (squared[k] + squared[k + 1])
+        return np.asarray(covs[0] if np.ndim(stamp_ns) == 0 else covs)
+
+    def _squared_accelerations(self) -> FloatArray:
+        """Squared acceleration ``(n, 3)`` of the position, twice, and of the yaw at each pose."""
+        steps = np.diff(self.stamps_ns)[:, None] * 1e-9
+        moved = np.diff(self.poses, axis=0)
+        moved[:, 2] = se2.wrap_array(moved[:, 2])
+        found = np.zeros((len(self), 3))
+        if len(self) == 2:
+            found[0] = (2.0 * moved / steps**2)[0]
+        else:
+            found[1:-1] = 2.0 * np.diff(moved / steps, axis=0) / (steps[1:] + steps[:-1])
+        squared: FloatArray = found**2
+        squared[:, :2] = squared[:, :2].sum(axis=1, keepdims=True)
+        return squared
+
+    def _inside(self, stamp_ns: int | IntArray) -> IntArray:
+        """Times ``(m,)`` that were asked for.
+
+        Raises:
+            TrajectoryError: the trajectory is empty, or a time lies outside it or is no whole number.
         """
         if not len(self):
             raise TrajectoryError("the trajectory is empty: nothing to interpolate")
-        asked = np.atleast_1d(np.asarray(stamp_ns, dtype=np.int64))
+        given = np.atleast_1d(np.asarray(stamp_ns))
+        if given.dtype.kind not in "iu":
+            given = np.array([whole_ns(stamp, TrajectoryError) for stamp in given.tolist()], dtype=np.int64)
+        asked: IntArray = given.astype(np.int64)
         first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
         outside = asked[(asked < first) | (asked > last)]
         if outside.size:
@@ -585,8 +651,7 @@ class Trajectory:
                 f"stamp {outside[0]} ns lies outside the trajectory; expected {first} to {last} ns. fgloc.Live "
                 "extrapolates beyond the last pose"
             )
-        poses = se2.interpolate(self.stamps_ns, self.poses, asked)
-        return poses[0] if np.ndim(stamp_ns) == 0 else poses
+        return asked
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -127,3 +127,39 @@ def test_example_smooths_and_plots(tmp_path):
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "path.png").stat().st_size > 5000
     assert "trajectory.tum" in {path.name for path in (tmp_path / "out").iterdir()}
+
+
+def test_interpolated_covariances_hold_the_errors_between_keyframes():
+    """Errors that keyframes share or do not, and a path that bends between them: NEES/3 stays about 1 or below."""
+    rng, t = np.random.default_rng(5), 0.2 * np.arange(400)
+    way = lambda t: np.column_stack([3.0 * np.sin(0.4 * t), 2.0 * np.sin(0.8 * t), np.sin(0.5 * t)])  # noqa: E731
+    covs = np.repeat(np.diag([0.003, 0.003, 0.002])[None] ** 2, len(t), axis=0)
+    independent = rng.normal(size=(len(t), 3))
+    shared = np.zeros_like(independent)
+    for k in range(1, len(t)):
+        shared[k] = 0.95 * shared[k - 1] + 0.31 * independent[k]
+    for noise in (independent, shared):
+        poses = way(t) + noise * np.sqrt(covs[:, range(3), range(3)])
+        trajectory = fgloc.Trajectory((t * 1e9).astype(np.int64), poses, covs)
+        at = trajectory.stamps_ns[:-1] + rng.integers(0, 200_000_000, len(t) - 1)
+        errors = trajectory.interpolate(at) - way(at * 1e-9)
+        found = trajectory.interpolate_covs(at)
+        linear = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covs[:-1]), errors).mean() / 3.0
+        assert np.einsum("ni,nij,nj->n", errors, np.linalg.inv(found), errors).mean() / 3.0 < min(1.4, linear)
+
+
+def test_interpolated_covariances_at_keyframes_and_without_any():
+    stamps, covs = np.array([0, 10, 20]), np.stack([np.eye(3) * k for k in (1.0, 2.0, 3.0)])
+    trajectory = fgloc.Trajectory(stamps, np.zeros((3, 3)), covs)
+    np.testing.assert_array_equal(trajectory.interpolate_covs(stamps), covs)
+    np.testing.assert_allclose(trajectory.interpolate_covs(5), 1.5 * np.eye(3))
+    rested = fgloc.Trajectory(np.array([0, 10**9]), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), covs[:2])
+    assert rested.interpolate_covs(5 * 10**8)[0, 0] == pytest.approx(1.5 + 0.25**2)  # it started from rest
+    with pytest.raises(fgloc.TrajectoryError):
+        fgloc.Trajectory(stamps, np.zeros((3, 3))).interpolate_covs(5)
+
+
+@pytest.mark.parametrize("stamp", [0.5, np.array([1.0, 2.5]), None, "1"])
+def test_interpolate_refuses_times_that_are_no_whole_nanoseconds(stamp):
+    with pytest.raises(fgloc.TrajectoryError):
+        fgloc.Trajectory(np.array([0, 20]), np.zeros((2, 3))).interpolate(stamp)
