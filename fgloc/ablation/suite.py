@@ -205,7 +205,8 @@ def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path)
             robot_file().model_validate(change)
         return config_of(content)
     except (ValidationError, ConfigError) as error:
-        lines = sentences(error, robot_file()) if isinstance(error, ValidationError) else str(error).splitlines()
+        given = merged(entry.settings, variant.config)
+        lines = sentences(error, robot_file(), given) if isinstance(error, ValidationError) else str(error).splitlines()
         raise ConfigError(
             "\n  ".join([f"variant '{variant.name}' of recording '{entry.name}': wrong configuration", *lines])
         ) from error

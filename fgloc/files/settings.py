@@ -234,7 +234,10 @@ _EXPECTED = {  # by the kind of error
     "int_parsing": "expected a whole number",
     "model_type": "expected keys with values",
     "model_attributes_type": "expected keys with values",
+    "dict_type": "expected keys with values",
+    "path_type": "expected the name of a file",
 }
+_OF_LISTS = ("tuple_type", "list_type", "set_type", "frozen_set_type", "too_short", "too_long")
 
 M = TypeVar("M", bound=BaseModel)
 S = TypeVar("S", bound=Section)
@@ -281,10 +284,8 @@ class Settings:
         try:
             return model.model_validate(self.content)
         except ValidationError as error:
-            found = _own(error)
-            wrong = sorted(
-                (self._line(e["loc"]), text) for e, text in zip(found, sentences(error, model), strict=False)
-            )
+            found = _complaints(error, model, self.content)
+            wrong = sorted((self._line(loc), text) for loc, text in found[:_MOST_SHOWN])
             lines = [f"{self.path}:{line}: {text}" for line, text in wrong]
             if len(found) > 1:
                 lines = [f"{self.path}: {len(found)} wrong values", *(f"  {line}" for line in lines)]
@@ -304,25 +305,97 @@ class Settings:
         return line
 
 
-def sentences(error: ValidationError, model: type[BaseModel]) -> list[str]:
-    """One sentence for each wrong value (the first ones of many): key, reason, value, likely correction."""
-    schema: dict[str, Any] | None = None
-    found = []
-    for e in _own(error)[:_MOST_SHOWN]:
-        where = ".".join(str(part) for part in e["loc"]) or "file"
+def sentences(error: ValidationError, model: type[BaseModel], content: Any = None) -> list[str]:
+    """One sentence for each wrong value (the first ones of many): key, reason, value, likely correction.
+
+    Args:
+        error: of the validation.
+        model: that was to be made.
+        content: of the file, as it was validated: keys are named as they stand there; None: it is not known.
+    """
+    return [text for _, text in _complaints(error, model, content)[:_MOST_SHOWN]]
+
+
+def _complaints(
+    error: ValidationError, model: type[BaseModel], content: Any
+) -> list[tuple[tuple[int | str, ...], str]]:
+    """Place and sentence of each wrong value; of a value that may be of several kinds, one sentence for all of them."""
+    schema = model.model_json_schema()
+    reasons: dict[tuple[int | str, ...], tuple[list[str], object]] = {}
+    for e in _own(error):
+        loc = e["loc"] if content is None else _in_file(e["loc"], content)
         if e["type"] == "extra_forbidden":
-            schema = schema or model.model_json_schema()
-            hint = _meant(str(e["loc"][-1]), _keys(schema, e["loc"][:-1]))
-            found.append(f"{where}: unknown key{hint} (got {short(e['input'])})")
+            reason = f"unknown key{_meant(str(loc[-1]), _keys(schema, e['loc'][:-1]))}"
+        elif e["type"] in _OF_LISTS:
+            reason = _list_wanted(_places(schema, e["loc"]), schema)
         else:
-            found.append(f"{where}: {_complaint(e)}")
+            reason = _complaint(e)
+        whole = e["type"] == "missing" or (e["type"] == "value_error" and isinstance(e["input"], dict))
+        several, _ = reasons.setdefault(loc, ([], _NOTHING if whole else e["input"]))
+        several.append(reason)
+    found = []
+    for loc, (several, value) in reasons.items():
+        first, *others = dict.fromkeys(several)
+        text = " or ".join([first, *(other.removeprefix("expected ") for other in others)])
+        where = ".".join(map(str, loc)) or "file"
+        found.append((loc, f"{where}: {text}{'' if value is _NOTHING else f' (got {short(value)})'}"))
     return found
 
 
+_NOTHING = object()
+
+
+def _in_file(loc: Sequence[int | str], content: Any) -> tuple[int | str, ...]:
+    """Keys and indices of a place as they stand in a file, without the kinds of value that pydantic tried."""
+    found: list[int | str] = []
+    for k, part in enumerate(loc):
+        if isinstance(content, Mapping):
+            key = next((key for key in content if str(key) == str(part)), None)
+            if key is not None:
+                found.append(part)
+                content = content[key]
+            elif k == len(loc) - 1 and str(part).isidentifier():  # a key that is missing
+                found.append(part)
+        elif isinstance(content, (list, tuple)) and isinstance(part, int):
+            found.append(part)
+            content = content[part] if part < len(content) else None
+    return tuple(found)
+
+
+def _list_wanted(places: Sequence[Any], schema: Mapping[str, Any]) -> str:
+    """Sentence on the list that a schema has at a place: its length, what is in it, and its description."""
+    described = next((place["description"] for place in places if "description" in place), "")
+    for place in _resolved(places, schema):
+        if "prefixItems" in place:
+            kinds = {inner.get("type") for inner in _resolved(place["prefixItems"], schema)}
+            things = "numbers" if kinds <= {"number", "integer"} else "values"
+            told = f"expected a list of {len(place['prefixItems'])} {things}"
+            return f"{told}, {described.partition('; None')[0]}" if described else told
+        if least := place.get("minItems", 0):
+            return (
+                f"expected a list of {least} to {place['maxItems']}"
+                if "maxItems" in place
+                else (f"expected a list of {least} or more")
+            )
+    return "expected a list"
+
+
 def _own(error: ValidationError) -> list[ErrorDetails]:
-    """The errors, without that of a list which is too short only because what it holds is wrong."""
+    """The errors; one, of the list, for the numbers that are missing at its end.
+
+    A list which is too short only because what it holds is wrong is none.
+    """
     found = error.errors()
-    return [e for e in found if e["type"] != "too_short" or not any(_is_within(o["loc"], e["loc"]) for o in found)]
+    own: list[ErrorDetails] = []
+    for e in found:
+        if e["type"] == "too_short" and any(_is_within(o["loc"], e["loc"]) for o in found):
+            continue
+        if e["type"] == "missing" and isinstance(e["loc"][-1], int):
+            e = ErrorDetails(type="too_short", loc=e["loc"][:-1], msg=e["msg"], input=e["input"])
+            if e in own:
+                continue
+        own.append(e)
+    return own
 
 
 def _is_within(inner: Sequence[int | str], outer: Sequence[int | str]) -> bool:
@@ -336,7 +409,7 @@ def _meant(word: str, known: Sequence[str]) -> str:
 
 
 def _complaint(e: ErrorDetails) -> str:
-    """Reason why a value is refused, in words that do not depend on pydantic."""
+    """Reason why a value is refused, in words that do not depend on pydantic, without the value."""
     kind, value, context = e["type"], e["input"], e.get("ctx", {})
     if kind == "missing":
         return "is missing"
@@ -344,12 +417,13 @@ def _complaint(e: ErrorDetails) -> str:
         known = re.findall(r"'([^']*)'", context["expected_tags"])
         hint = _meant(context["tag"], known) or f"; known are {', '.join(known)}"
         return f"there is no {context['discriminator'].strip(chr(39))} '{context['tag']}'{hint}"
+    if kind == "union_tag_not_found":
+        return f"{context['discriminator'].strip(chr(39))} is missing"
     if kind == "literal_error":
         hint = _meant(str(value), re.findall(r"'([^']*)'", context["expected"]))
-        return f"expected {context['expected']}{hint} (got {short(value)})"
+        return f"expected {context['expected']}{hint}"
     text = _EXPECTED.get(kind) or e["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
-    text = text.replace("Input should be", "expected").replace("a valid ", "a ")
-    return text if kind == "value_error" and isinstance(value, dict) else f"{text} (got {short(value)})"
+    return text.replace("Input should be", "expected").replace("a valid ", "a ")
 
 
 def short(value: object) -> str:
@@ -362,21 +436,27 @@ def short(value: object) -> str:
 
 def _keys(schema: Mapping[str, Any], loc: Sequence[int | str]) -> list[str]:
     """Keys that a model knows at a place."""
-    places = [schema]
+    return [key for place in _resolved(_places(schema, loc), schema) for key in place.get("properties", {})]
+
+
+def _places(schema: Mapping[str, Any], loc: Sequence[int | str]) -> list[Any]:
+    """Schemas of a place, not resolved; a part that none of them knows is a kind of value that pydantic tried."""
+    places: list[Any] = [schema]
     for part in loc:
         inner: list[Any] = []
         for place in _resolved(places, schema):
             mapping = place.get("discriminator", {}).get("mapping", {})
             if part in mapping:
                 inner.append({"$ref": mapping[part]})
-            elif isinstance(part, int):
-                inner += [place["items"]] if "items" in place else place.get("prefixItems", [])
+            elif isinstance(part, int) and ("items" in place or "prefixItems" in place):
+                inner += [place["items"]] if "items" in place else place["prefixItems"]
             elif part in place.get("properties", {}):
                 inner.append(place["properties"][part])
-            elif isinstance(place.get("additionalProperties"), dict):
-                inner.append(place["additionalProperties"])
-        places = inner
-    return [key for place in _resolved(places, schema) for key in place.get("properties", {})]
+            else:
+                any_key = [place.get("additionalProperties"), *place.get("patternProperties", {}).values()]
+                inner += [values for values in any_key if isinstance(values, dict)]
+        places = inner or places
+    return places
 
 
 def _resolved(places: Sequence[Any], schema: Mapping[str, Any]) -> list[Any]:

@@ -99,8 +99,9 @@ _KINDS = {".bag": "ros1", ".active": "ros1", ".mcap": "mcap", ".db3": "sqlite3"}
 _MAGIC = {
     b"#ROSBAG V2.0": (".bag", "a ROS 1 bag"),
     b"\x89MCAP0\r\n": (".mcap", "an MCAP"),
-    b"SQLite format 3\0": (".db3", "SQLite"),
+    b"SQLite format 3\0": (".db3", "an SQLite database"),
 }
+_NAMES = {_KINDS[suffix]: name for suffix, name in _MAGIC.values()}
 _MOST_NAMED = 5
 _LITTLE = 0.01  # share of a recording whose loss is worth no warning
 EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
@@ -218,6 +219,16 @@ def _other_name(path: Path) -> str:
         if head.startswith(magic) and _KINDS.get(path.suffix) != _KINDS[suffix]:
             return f"its content is {what}: rename it to {path.with_suffix(suffix).name}"
     return "" if head else "it is empty: the recorder wrote nothing, or its copy failed"
+
+
+def _has_magic(path: Path, kind: str) -> bool:
+    """Whether a file begins as those of its kind do; one that cannot be opened may."""
+    magic = next(magic for magic, (suffix, _) in _MAGIC.items() if _KINDS[suffix] == kind)
+    try:
+        with path.open("rb") as file:
+            return file.read(len(magic)) == magic
+    except OSError:
+        return True
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -425,7 +436,7 @@ class _File:
     def _recover(self, error: Exception) -> None:
         if isinstance(error, TooLargeError):
             raise error
-        reason = _reason(error)
+        reason = _reason(error) if _has_magic(self._path, self._kind) else f"it is not {_NAMES[self._kind]}"
         if not self._recovered and (other := _other_name(self._path)):
             raise RecordingError(f"{self._path}: cannot be read; {other}.") from error
         if self._recovered or isinstance(error, (PermissionError, FileNotFoundError)):
@@ -436,7 +447,7 @@ class _File:
             reader = _open(recovered.path, kind_of(recovered.path), again) if again is not None else None
         except TooLargeError:
             raise
-        except Exception as second:
+        except Exception as second:  # damaged bytes make the parser raise anything
             raise RecordingError(f"{self._path}: cannot be read: {reason}; nor salvaged: {_reason(second)}.") from error
         if reader is None:
             raise RecordingError(
@@ -492,4 +503,6 @@ def _checked(reader: Any, kind: str, budget: Budget) -> Any:
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, UnicodeDecodeError):
+        return "its texts are damaged"
     return str(error).strip().rstrip(".") or type(error).__name__

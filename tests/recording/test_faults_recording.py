@@ -396,3 +396,14 @@ def test_an_empty_file_is_said_to_be_empty(tmp_path):
     path.touch()
     with pytest.raises(RecordingError, match=r"run\.mcap.*empty"):
         open_recording(path, DEFAULT)
+
+
+@pytest.mark.parametrize("content", [np.random.default_rng(0).bytes(3000), b"hello\n" * 50, b"\xff\xfe" * 500])
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_fault_63_a_file_of_another_kind_is_said_to_be_one(tmp_path, content, suffix):
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match="it is not") as caught:
+        open_recording(path, DEFAULT)
+    assert str(path) in str(caught.value)
+    assert "codec" not in str(caught.value)
