@@ -52,6 +52,7 @@ from fgloc.types import Decision, FloatArray, IntArray, Landmark, LandmarkMap, T
 # --- Trajectory: the map, the way with its times, and below it how large sigma and error are --------------------------
 
 _MAX_ELLIPSES = 60
+_SEEN = 0.06  # of the picture: smaller ellipses are enlarged up to it, or the way's line would cover them
 _FILLED = 0.1  # of the picture: larger ellipses are outlines, or they would cover the map ...
 _DRAWN = 1.0  # ... and still larger ones lie around it, and are left out
 _MAX_OUTLINES = 8
@@ -187,18 +188,28 @@ def _draw_ellipses(axes: Axes, estimate: Trajectory, extent: float) -> list[Arti
     chosen = chosen[chosen < len(estimate)]
     values, _ = np.linalg.eigh(estimate.covs[chosen, :2, :2])
     sizes = 6.0 * np.sqrt(np.maximum(values[:, 1], 0.0))  # full axes: twice 3σ
+    times = _enlarged(sizes, extent)
+    sizes = times * sizes
+    covs, told = times**2 * estimate.covs[:, :2, :2], f", {times:g} times enlarged" if times > 1.0 else ""
     small, large = chosen[sizes <= _FILLED * extent], chosen[(sizes > _FILLED * extent) & (sizes <= _DRAWN * extent)]
     handles: list[Artist] = []
     if len(small):
         look: dict[str, Any] = dict(facecolors=BLUE, edgecolors=BLUE, linewidths=0.5, alpha=0.2)
-        add_ellipses(axes, estimate.poses[small, :2], estimate.covs[small, :2, :2], look)
-        handles.append(Patch(facecolor=BLUE, alpha=0.2, label="3σ of the position"))
+        add_ellipses(axes, estimate.poses[small, :2], covs[small], look)
+        handles.append(Patch(facecolor=BLUE, alpha=0.2, label=f"3σ of the position{told}"))
     if len(large):
         large = large[np.unique(np.linspace(0, len(large) - 1, _MAX_OUTLINES).round().astype(int))]
         look = dict(facecolors="none", edgecolors=SKY, linewidths=0.9, linestyles="--", zorder=1)
-        add_ellipses(axes, estimate.poses[large, :2], estimate.covs[large, :2, :2], look)
-        handles.append(Line2D([], [], color=SKY, lw=0.9, linestyle="--", label="3σ, where it is large"))
+        add_ellipses(axes, estimate.poses[large, :2], covs[large], look)
+        handles.append(Line2D([], [], color=SKY, lw=0.9, linestyle="--", label=f"3σ, where it is large{told}"))
     return handles
+
+
+def _enlarged(sizes: FloatArray, extent: float) -> float:
+    """Times that ellipses of these sizes [m] are enlarged, to be wider than the way's line: 1, 2, 5, 10, ..."""
+    usual = float(np.percentile(sizes, 90.0)) if len(sizes) else 0.0
+    fitting = [k for k in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0) if k * usual < _SEEN * extent]
+    return fitting[-1] if fitting and usual > 0.0 else 1.0
 
 
 def add_ellipses(axes: Axes, places: FloatArray, covs: FloatArray, look: dict[str, Any]) -> None:
@@ -267,7 +278,7 @@ def _draw_distance(axes: Axes, result: RunData, matched: Matched | None) -> list
     axes.set_ylabel(f"{'error, ' if matched is not None else ''}3σ [{scale.name}]", fontsize=NORMAL)
     axes.set_xlabel("time from the first pose [s]", fontsize=NORMAL)
     shade_modes(axes, result)
-    axis = TimeAxis.of(result)
+    axis = TimeAxis.of(result, received=False)
     axis.draw_cuts(axes, told=True)
     axis.apply(axes)
     return handles
@@ -282,7 +293,7 @@ def plot_error(result: RunData, matched: Matched | None) -> Figure:
     bands = None if trajectory.covs is None else 3.0 * np.sqrt(np.diagonal(trajectory.covs, axis1=1, axis2=2))
     figure = Figure(figsize=(WIDTH, 4.4), dpi=DPI, layout="constrained")
     rows: list[Axes] = figure.subplots(3, 1, sharex=True).tolist()
-    axis_of_time = TimeAxis.of(result)
+    axis_of_time = TimeAxis.of(result, received=False)
     for axis, (axes, name) in enumerate(zip(rows, ("x", "y", "yaw"), strict=True)):
         known = None if matched is None else (matched.stamps_ns, np.abs(matched.errors[:, axis]))
         scale = ErrorScale.of(result, None if bands is None else bands[:, axis], known, angle=axis == 2)

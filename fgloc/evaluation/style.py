@@ -143,11 +143,16 @@ class TimeAxis:
     places: FloatArray
 
     @classmethod
-    def of(cls, result: RunData) -> TimeAxis:
-        """Axis from the first message or pose to the last pose of a run."""
+    def of(cls, result: RunData, received: bool = True) -> TimeAxis:
+        """Axis from the first pose to the last one of a run; ``received``: from the messages that lead to the first."""
         poses = seconds(result, result.trajectory.stamps_ns)
-        first = min([float(poses[0]), *(float(t.times.min()) for t in result.spans.values() if len(t.times))])
-        first = max(first, float(poses[0]) - max(np.ptp(poses), 1.0))  # a stray old message is no reason to show years
+        first = float(poses[0])
+        before = np.concatenate([np.zeros(0), *(t.times for t in result.spans.values())]) if received else np.zeros(0)
+        for time in sorted(before[before < first].tolist(), reverse=True):
+            if first - time > _SHORTEST_S:  # a stray old message, or a topic of another clock: nothing leads from it
+                break
+            first = time
+        first = max(first, float(poses[0]) - max(np.ptp(poses), 1.0))
         times = np.concatenate([[first], poses, [max(float(poses[-1]), first + 1e-3)]])
         steps = np.diff(times)
         held = float(steps[steps <= _SHORTEST_S].sum())

@@ -9,6 +9,7 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgba
 from run_results import figure_eight
 
@@ -274,3 +275,26 @@ def test_the_simulators_slip_is_read_from_the_recording():
         counts[name] = np.sum(spans[:, 1] - spans[:, 0]) * 1e-9
     assert counts["first_run"] < 1.0
     assert counts["patches_run"] > 5.0
+
+
+def test_the_axis_of_time_begins_where_messages_lead_to_the_first_pose():
+    """A stray old message, or a topic of another clock, does not move its beginning; without messages it is at 0."""
+    old = {
+        "/tf_static": TopicTimes(np.array([-35.0]), 1, 1, 0.0),
+        "/odom": TopicTimes(np.arange(-2.0, 29.9, 0.05), 638, 1, 0.05),
+    }
+    result = replace(figure_eight(), spans=old)
+    assert TimeAxis.of(result).knots[0] == pytest.approx(-2.0)
+    for figure in (plot_trajectory(result, None), plot_error(result, None)):
+        assert -1.0 < figure.axes[-1].get_xlim()[0] <= 0.0
+
+
+@pytest.mark.parametrize(("sigma", "enlarged"), [(1e-3, True), (0.1, False)])
+def test_ellipses_are_enlarged_where_they_would_not_be_seen_and_it_is_said(sigma, enlarged):
+    base = figure_eight()
+    covs = np.repeat(np.diag([sigma, sigma, sigma])[None] ** 2, len(base.trajectory), axis=0)
+    figure = plot_trajectory(replace(base, trajectory=replace(base.trajectory, covs=covs)), None)
+    (drawn,) = [c for c in figure.axes[0].collections if isinstance(c, EllipseCollection)]
+    told = [text.get_text() for text in figure.legends[0].get_texts() if text.get_text().startswith("3σ")]
+    assert max(drawn.get_widths()) > 0.1
+    assert any(any(c.isdigit() for c in text.removeprefix("3σ")) for text in told) == enlarged
