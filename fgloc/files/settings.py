@@ -320,17 +320,21 @@ def _complaints(
     error: ValidationError, model: type[BaseModel], content: Any
 ) -> list[tuple[tuple[int | str, ...], str]]:
     """Place and sentence of each wrong value; of a value that may be of several kinds, one sentence for all of them."""
-    schema = model.model_json_schema()
+    schema: dict[str, Any] = {}
     reasons: dict[tuple[int | str, ...], tuple[list[str], object]] = {}
     for e in _own(error):
         loc = e["loc"] if content is None else _in_file(e["loc"], content)
+        if not schema and e["type"] in ("extra_forbidden", *_OF_LISTS):  # it takes long to make
+            schema = model.model_json_schema()
         if e["type"] == "extra_forbidden":
             reason = f"unknown key{_meant(str(loc[-1]), _keys(schema, e['loc'][:-1]))}"
         elif e["type"] in _OF_LISTS:
             reason = _list_wanted(_places(schema, e["loc"]), schema)
         else:
             reason = _complaint(e)
-        whole = e["type"] == "missing" or (e["type"] == "value_error" and isinstance(e["input"], dict))
+        whole = e["type"] in ("missing", "union_tag_invalid") or (
+            e["type"] == "value_error" and isinstance(e["input"], dict)
+        )
         several, _ = reasons.setdefault(loc, ([], _NOTHING if whole else e["input"]))
         several.append(reason)
     found = []
