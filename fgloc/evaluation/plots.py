@@ -355,7 +355,7 @@ def plot_protection(result: RunData, matched: Matched, alert_m: float | None) ->
 # --- Timeline: messages received, weights of the sources, fit of the sightings, flags, errors -------------------------
 
 _LEAST_SHOWN_M = 1e-4
-_NOT_SEEN = ("unknown", "place", "prior", "mode", "clock")
+_NOT_SEEN = ("unknown", "place", "prior", "mode", "clock", "lift")
 _MAX_FLAGS = 12
 _MAX_LANDMARKS = 20
 _ROW_IN = 0.18  # inches

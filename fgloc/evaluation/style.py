@@ -108,9 +108,16 @@ def mode_handles(result: RunData) -> list[Artist]:
     ]
 
 
+_HANDLE, _LINE = 6, 110  # characters: of a legend's symbol and space, and of its line
+
+
 def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     """Put a legend above the plots."""
-    columns = math.ceil(len(handles) / math.ceil(len(handles) / 4))
+    widths = [len(str(handle.get_label())) + _HANDLE for handle in handles]
+    rows = max(1, math.ceil(len(widths) / 4))
+    while sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows)) > _LINE and rows < len(widths):
+        rows += 1
+    columns = max(1, math.ceil(len(widths) / rows))
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=NORMAL)
 
 
