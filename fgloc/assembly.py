@@ -75,6 +75,7 @@ def assemble(
     config: Config,
     keep_all: bool,
     landmark_map: LandmarkMap | None = None,
+    causal: bool = True,
 ) -> Assembly:
     """Build and check the parts for a recording.
 
@@ -84,11 +85,12 @@ def assemble(
         config: all settings.
         keep_all: as `Localizer` has it.
         landmark_map: the map as it is to be used, if not as the file has it.
+        causal: as `KeyframeBuilder` has it.
 
     Raises:
         FglocError: as `recorded_setup` has it.
     """
-    return _assembled(recorded_setup(recording, map_path, config, landmark_map), keep_all)
+    return _assembled(recorded_setup(recording, map_path, config, landmark_map), keep_all, causal)
 
 
 def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config: Config, keep_all: bool) -> Assembly:
@@ -96,7 +98,7 @@ def assemble_stream(facts: StreamFacts, landmark_map: LandmarkMap | None, config
     return _assembled(sensor_setup(facts, landmark_map, config), keep_all)
 
 
-def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
+def _assembled(setup: SensorSetup, keep_all: bool, causal: bool = True) -> Assembly:
     config, landmark_map, sensors = setup.config, setup.landmark_map, setup.sensors
     learned, cameras = setup.learned, setup.cameras
     joint = learned.model.joint if learned is not None and config.motion.correlation == "joint" else None
@@ -119,7 +121,7 @@ def _assembled(setup: SensorSetup, keep_all: bool) -> Assembly:
         gate=EventValidator(reported_bounds(config), known_ids, streams, named),
         detector=setup.detector,
         detections=EventValidator(reported_bounds(config), known_ids, named=named),
-        stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s, streams, named),
+        stepper=KeyframeBuilder(config.keyframes, config.gate, config.estimator.lag_s, streams, named, causal),
         wheels=wheels,
         landmarks=landmarks,
         cameras=cameras,

@@ -181,7 +181,8 @@ def run(
         wrong = find_mistakes(recording_path, map_path, config) if check else Mistakes((), config)
     config = wrong.config
     with open_recording(recording_path, config.recording) as recording:
-        parts = assemble(recording, map_path, config, mode == "batch" or map_path is None, wrong.landmark_map)
+        batch = mode == "batch"
+        parts = assemble(recording, map_path, config, batch or map_path is None, wrong.landmark_map, not batch)
         replay = replayed(recording, parts, mode, progress, options)
         outcome = Outcome.of(recording, parts, replay, wrong)
     if not replay.estimates:

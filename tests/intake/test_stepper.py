@@ -21,9 +21,12 @@ from event_makers import (
     times,
 )
 
+from fgloc.config import GateConfig, KeyframesConfig, WheelsConfig
+from fgloc.intake.keyframing import KeyframeBuilder
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
+from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent
 
 MOTION = (OdometryEvent, ControlEvent, JointsEvent, ImuEvent)
@@ -269,3 +272,33 @@ def test_fault_24_memory_stays_bounded():
     finally:
         tracemalloc.stop()
     assert sizes[-1] < 1.05 * sizes[2] + 20_000
+
+
+@pytest.mark.parametrize("causal", [True, False])
+def test_a_whole_recording_has_the_motion_within_a_silence_of_the_wheels(causal):
+    """Commands go on for 4 s in which no joints come, and the wheels turn on."""
+    heard = [t for t in times(100.0, 112.0, 20) if not 104.0 < t < 108.0]
+    events = in_order_of_receipt(
+        [joints(t, t - 100.0, t - 100.0) for t in heard],
+        [command(t, 0.1) for t in times(100.0, 112.0, 10)],
+    )
+    wheels = WheelMotion(WheelsConfig(source="ticks", left_radius=0.1, right_radius=0.1, track=0.3))
+    moved = [
+        wheels.measure(s) for s in run(KeyframeBuilder(KeyframesConfig(), GateConfig(), 10.0, causal=causal), events)
+    ]
+    way = sum(m.motion[0] for m in moved if m is not None)
+    if causal:  # who waits for no message does not know it
+        assert wheels.unknown_s > 1.0
+    else:
+        assert wheels.unknown_s == 0.0
+        assert way == pytest.approx(1.195, abs=0.01)
+
+
+def test_a_source_of_a_whole_recording_that_ends_is_not_waited_for_to_the_end():
+    events = in_order_of_receipt(
+        [odometry(t, twist=(0.5, 0.1)) for t in times(100.0, 140.0, 20)], [imu(t) for t in times(100.0, 110.0, 50)]
+    )
+    builder = KeyframeBuilder(KeyframesConfig(), GateConfig(), 10.0, causal=False)
+    late_s = [(e.stamp_ns - s.stamp_ns) * 1e-9 for e in events for s in builder.push(e)]
+    assert 9.0 < max(late_s) < 11.0
+    assert late_s[-1] < 11.0

@@ -246,7 +246,8 @@ def _advance(
 
 
 MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings beyond them is a reset
-_FIRST_USUAL_S, _USUAL_SHARE = 0.05, 0.05  # between readings, before any came; share of the newest in the mean
+_FIRST_USUAL_S = 0.05  # between readings, before any came
+_MOST_USUAL = 20  # newest of which it is the mean
 MAX_GAP_S = 5.0  # over a longer gap no difference is used: the robot may have been restarted
 
 
@@ -272,7 +273,7 @@ class Track:
         self._hold_ns = int(config.hold_s * 1e9)
         self._last_ns: int | None = None  # the newest stamp taken in
         self._given_ns = 0  # motion before this time was given to earlier steps
-        self._usual_s = _FIRST_USUAL_S  # mean time between readings
+        self._usual_s, self._usual_of = _FIRST_USUAL_S, 1  # mean time between readings, and of how many
         self._forget()
 
     def ingest(self, step: Step) -> None:
@@ -345,7 +346,8 @@ class Track:
         """Set the stamp of the newest reading; ``held`` is assumed beyond it."""
         if self._last_ns is not None:
             seconds = min((stamp_ns - self._last_ns) * 1e-9, self._config.hold_s)
-            self._usual_s += _USUAL_SHARE * (seconds - self._usual_s)
+            self._usual_of = min(self._usual_of + 1, _MOST_USUAL)
+            self._usual_s += (seconds - self._usual_s) / self._usual_of
         self._last_ns = stamp_ns
         if held is not None:
             by = None if by is None else self._true_by(held, by)
