@@ -108,7 +108,7 @@ def _most_likely(
 ) -> tuple[FloatArray, float] | None:
     """Most likely factors ``(2,)`` and their gain of log-likelihood; None: too few steps have sound wheels."""
     with open_recording(bag, config.recording) as recording:
-        parts = assemble(recording, map_path, config, True)
+        parts = assemble(recording, map_path, config, True, causal=False)
         longest_s = _EXCERPT_S if parts.detector is None else _IMAGES_S
         replay = replayed(recording, parts, "batch", progress, {"events": lambda events: _first(events, longest_s)})
     log = parts.localizer.estimator.log

@@ -36,7 +36,7 @@ def whole_ns(stamp: Any, error: type[FglocError]) -> int:
     """
     try:
         whole = int(stamp)
-        if whole == stamp:
+        if whole == stamp and abs(whole) < 2**63:
             return whole
     except (TypeError, ValueError, OverflowError):
         pass
@@ -429,6 +429,10 @@ class Lost(Grave):
         made.share = share
         return made
 
+    def __getnewargs__(self) -> tuple[str, float]:  # type: ignore[override]
+        """Arguments of a copy."""
+        return str(self), self.share
+
 
 REMARKS = ("run", "recording", "batch")
 """Codes of sentences on what a run does with its recording and settings; nothing was compared."""
@@ -641,7 +645,7 @@ class Trajectory:
         if not len(self):
             raise TrajectoryError("the trajectory is empty: nothing to interpolate")
         given = np.atleast_1d(np.asarray(stamp_ns))
-        if given.dtype.kind not in "iu":
+        if given.dtype.kind != "i":
             given = np.array([whole_ns(stamp, TrajectoryError) for stamp in given.tolist()], dtype=np.int64)
         asked: IntArray = given.astype(np.int64)
         first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])

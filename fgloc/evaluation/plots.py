@@ -188,20 +188,19 @@ def _draw_ellipses(axes: Axes, estimate: Trajectory, extent: float) -> list[Arti
     chosen = chosen[chosen < len(estimate)]
     values, _ = np.linalg.eigh(estimate.covs[chosen, :2, :2])
     sizes = 6.0 * np.sqrt(np.maximum(values[:, 1], 0.0))  # full axes: twice 3σ
-    times = _enlarged(sizes, extent)
-    sizes = times * sizes
-    covs, told = times**2 * estimate.covs[:, :2, :2], f", {times:g} times enlarged" if times > 1.0 else ""
     small, large = chosen[sizes <= _FILLED * extent], chosen[(sizes > _FILLED * extent) & (sizes <= _DRAWN * extent)]
+    times = _enlarged(sizes[sizes <= _FILLED * extent], extent)
+    told = f", {times:g} times enlarged" if times > 1.0 else ""
     handles: list[Artist] = []
     if len(small):
         look: dict[str, Any] = dict(facecolors=BLUE, edgecolors=BLUE, linewidths=0.5, alpha=0.2)
-        add_ellipses(axes, estimate.poses[small, :2], covs[small], look)
+        add_ellipses(axes, estimate.poses[small, :2], times**2 * estimate.covs[small, :2, :2], look)
         handles.append(Patch(facecolor=BLUE, alpha=0.2, label=f"3σ of the position{told}"))
     if len(large):
         large = large[np.unique(np.linspace(0, len(large) - 1, _MAX_OUTLINES).round().astype(int))]
         look = dict(facecolors="none", edgecolors=SKY, linewidths=0.9, linestyles="--", zorder=1)
-        add_ellipses(axes, estimate.poses[large, :2], covs[large], look)
-        handles.append(Line2D([], [], color=SKY, lw=0.9, linestyle="--", label=f"3σ, where it is large{told}"))
+        add_ellipses(axes, estimate.poses[large, :2], estimate.covs[large, :2, :2], look)
+        handles.append(Line2D([], [], color=SKY, lw=0.9, linestyle="--", label="3σ, where it is large"))
     return handles
 
 

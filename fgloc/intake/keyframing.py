@@ -125,7 +125,7 @@ _MAX_STEP_NS = 1_000_000_000  # motion models are made for steps up to this
 _MOST_REACHED = 4096  # newest stamps that are remembered: 4 s of a busy robot
 _ALIVE_NS = 2_000_000_000  # a source without messages for longer is not waited for ...
 _SILENCE_NS = 500_000_000  # ... of which a silence of all sources counts no more than this
-_WHOLE_NS = 10_000_000_000  # ... in a whole recording; there it may be silent for so long and go on
+_WHOLE_NS = 10_000_000_000  # ... in a whole recording; there no keyframe waits for longer
 _USED_LATE = (SightingsEvent, SensorEvent)
 
 
@@ -141,8 +141,8 @@ class KeyframeBuilder:
     stamp. A command holds until the next: of its topic nothing beyond the keyframe is needed, and it is waited for no
     longer than its messages have lately been behind those of other topics. Measured motion older than the last
     keyframe is lost ("late"), commands and sightings are not; their source is waited for longer in the next minute, up
-    to 1 s. In a whole recording (not ``causal``) a source that goes on within 10 s is waited for: wheel angles at both
-    ends of a silence tell the motion in it. Clock jumps (see ``ClockGuard``) end the segment.
+    to 1 s. In a whole recording (not ``causal``) one that goes on within 10 s is waited for: wheel angles up to 5 s
+    apart tell the motion between them. Clock jumps (see ``ClockGuard``) end the segment.
 
     The first step of a segment has ``start_ns == stamp_ns``. Depends on the events alone, never on the wall clock.
     ``rejections`` counts by "sensor.reason" with the reasons late, duplicate and future.
@@ -354,14 +354,20 @@ class KeyframeBuilder:
         newest, waited_ns = self._newest_ns, self._waited(stamp_ns)
         if newest < stamp_ns + (self._reorder_ns if self._last_ns is None else 0):
             return False
-        alive_ns = _ALIVE_NS if self._causal else _WHOLE_NS
+        if not self._causal and newest >= stamp_ns + _WHOLE_NS:
+            return True
         return all(
             source.newest_ns >= stamp_ns + source.disorder_ns.ns
             or (self._causal and newest >= stamp_ns + source.patience_ns and waited_ns >= source.patience_ns // 2)
             or (source.held and min(newest - stamp_ns, waited_ns) >= source.settled_ns)
-            or (newest > source.newest_ns + alive_ns and self._heard_ns - source.heard_ns >= _ALIVE_NS // 2)
+            or self._ended(source)
             for source in self._sources.values()
         )
+
+    def _ended(self, source: Punctuality) -> bool:
+        """Whether a source has been silent for so long that it is not waited for."""
+        alive_ns = _ALIVE_NS if self._causal else _WHOLE_NS
+        return self._newest_ns > source.newest_ns + alive_ns and self._heard_ns - source.heard_ns >= _ALIVE_NS // 2
 
     def _waited(self, stamp_ns: int) -> int:
         """Time since this stamp was reached [ns], by receive times: after a stall, topics come one after another."""

@@ -39,7 +39,7 @@ def test_what_is_not_clear_is_left_to_the_user(names):
 RADIUS, TRACK = 0.033, 0.16
 
 
-def driven(by_pose):
+def driven(by_pose, heading_off=0.0):
     """Joints and odometry of a robot that speeds up and turns; only its pose, or only its twist, is the wheels'."""
     dt, yaw, place, turned = 0.05, 0.0, np.zeros(2), np.zeros(2)
     joint_events, odometry_events = [], []
@@ -48,6 +48,8 @@ def driven(by_pose):
         rates = (v + np.array([-0.5, 0.5]) * TRACK * omega) / RADIUS
         joint_events.append(joints(1.0 + k * dt, *turned, names=("left_wheel", "right_wheel")))
         pose, twist = ((*place, yaw), (0.95 * v, 1.05 * omega)) if by_pose else ((0.0, 0.0, 0.0), (v, omega))
+        if heading_off:
+            pose, twist = (*place, yaw + heading_off), (v, omega)
         odometry_events.append(odometry(1.0 + k * dt, pose, twist))
         heading = yaw + 0.5 * omega * dt
         place = place + v * dt * np.array([math.cos(heading), math.sin(heading)])
@@ -58,5 +60,11 @@ def driven(by_pose):
 @pytest.mark.parametrize("by_pose", [True, False])
 def test_radius_and_track_are_those_that_the_driver_sums_its_pose_up_with(by_pose):
     found = fit_geometry(WheelPair("left_wheel", "right_wheel"), *driven(by_pose))
+    assert found.radius_m == pytest.approx(RADIUS, rel=0.005)
+    assert found.track_m == pytest.approx(TRACK, rel=0.01)
+
+
+def test_a_pose_whose_heading_is_not_its_way_tells_no_radius():
+    found = fit_geometry(WheelPair("left_wheel", "right_wheel"), *driven(True, heading_off=0.2))
     assert found.radius_m == pytest.approx(RADIUS, rel=0.005)
     assert found.track_m == pytest.approx(TRACK, rel=0.01)

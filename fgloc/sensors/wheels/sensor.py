@@ -106,6 +106,7 @@ _LEAST_TURNING = 0.05  # rad/s: standard deviation of the yaw rate below which t
 NAMED_BY = 100  # messages whose joints are looked at: arm and wheels may take turns on a topic
 _WINDOW_S = 0.3  # over which rates are means: stamps of single messages jitter
 _STEADY_S = 1.0  # after a command: by then the wheels turn as they are told
+_ASKEW = 0.01  # rad: a pose whose heading is off its way by more has the heading from elsewhere
 _ALIKE = 0.05  # relative spread of the track that commands give at different times
 
 
@@ -166,6 +167,7 @@ def fit_geometry(
     seconds, angles = (stamps[keep] - origin_ns) * 1e-9, angles[keep]
     later = np.minimum(np.searchsorted(seconds, seconds + _WINDOW_S), len(seconds) - 1)
     lasted = seconds[later] - seconds
+    by_commands = None
     for at, gone in _paths(odometry, origin_ns):
         heard = np.searchsorted(at, seconds[later], side="right") - np.searchsorted(at, seconds)
         whole = (lasted > 0.5 * _WINDOW_S) & (lasted < 2.0 * _WINDOW_S) & (heard > 1)  # no silence in it
@@ -176,19 +178,19 @@ def fit_geometry(
         difference = rates[:, 1] - rates[:, 0]
         radius = _slope(rates.mean(axis=1), means[:, 0])
         per_difference = _slope(difference, means[:, 1]) if means[:, 1].std() > _LEAST_TURNING else None
-        by_commands = per_difference is None
-        if per_difference is None:
-            per_difference = _commanded(np.asarray(seconds[whole] + origin_ns * 1e-9), difference, commands)
         if radius is not None and per_difference is not None:
-            return WheelGeometry(radius, radius / per_difference, by_commands)
-    return None
+            return WheelGeometry(radius, radius / per_difference)
+        commanded = _commanded(np.asarray(seconds[whole] + origin_ns * 1e-9), difference, commands)
+        if by_commands is None and radius is not None and commanded is not None:
+            by_commands = WheelGeometry(radius, radius / commanded, by_commands=True)
+    return by_commands
 
 
 def _paths(odometry: Sequence[OdometryEvent], origin_ns: int) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Times ``(n,)`` [s] and way along the heading [m] and turn [rad] ``(n, 2)`` since the first, in order of time.
 
-    First those of the poses: the driver has summed them up from each of its readings, of which silences and twists at
-    single times show a part only. Then those of the twists.
+    First those of the poses, if they move where they head: the driver has summed them up from each of its readings, of
+    which silences and twists at single times show a part only. Then those of the twists.
     """
     rows = [
         (e.stamp_ns - origin_ns, *e.position[:2], quaternion_yaw(e.orientation), e.linear[0], e.angular[2])
@@ -206,8 +208,11 @@ def _paths(odometry: Sequence[OdometryEvent], origin_ns: int) -> Iterator[tuple[
         else:
             turns = np.remainder(np.diff(told[:, 2]) + math.pi, math.tau) - math.pi
             heading = told[:-1, 2] + 0.5 * turns
-            ways = np.diff(told[:, :2], axis=0)
-            steps = np.column_stack([(ways * np.column_stack([np.cos(heading), np.sin(heading)])).sum(axis=1), turns])
+            dx, dy = np.diff(told[:, :2], axis=0).T
+            ahead, aside = np.cos(heading) * dx + np.sin(heading) * dy, np.cos(heading) * dy - np.sin(heading) * dx
+            if abs(float(np.sign(ahead) @ aside)) > _ASKEW * float(np.abs(ahead).sum()):
+                continue
+            steps = np.column_stack([ahead, turns])
         yield at, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
@@ -472,7 +477,7 @@ def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
         )
         found.append(RawMistake("wheels.roll_over", sentence, "wheels", {"angle_range": rolled[0]}))
     wheels = config.wheels
-    joints = [e for e in motion if isinstance(e, JointsEvent)]
+    joints = [e for e in motion if isinstance(e, JointsEvent) and e.names]
     others = any(isinstance(e, (OdometryEvent, ControlEvent)) for e in motion)
     if len(joints) < 10 or wheels.source not in ("auto", "ticks"):
         return tuple(found)
