@@ -31,7 +31,7 @@ from fgloc.types import (
     FloatArray,
     Grave,
     Ground,
-    Lost,
+    LostData,
     Protection,
     Severity,
     Trajectory,
@@ -107,7 +107,7 @@ def _hints(recording: Recording, parts: Assembly, replay: Replay) -> list[str]:
 def _graded(code: str, texts: Iterable[str]) -> Iterator[Finding]:
     """Findings of a part of the run: warnings of what it calls grave."""
     for text in texts:
-        if isinstance(text, Lost):
+        if isinstance(text, LostData):
             yield Finding(f"{code}.lost", sentence(text), Severity.WARNING, value=text.share)
         else:
             yield Finding(code, sentence(text), Severity.WARNING if isinstance(text, Grave) else Severity.NOTE)

@@ -418,12 +418,12 @@ class Grave(str):
     """A note of which a warning is made: data are damaged, in another unit, or not of this map."""
 
 
-class Lost(Grave):
+class LostData(Grave):
     """A note that part of a recording cannot be read; ``share`` of it as far as that is known."""
 
     share: float
 
-    def __new__(cls, text: str, share: float) -> Lost:
+    def __new__(cls, text: str, share: float) -> LostData:
         """Note with the share that is lost, from 0 to 1."""
         made = super().__new__(cls, text)
         made.share = share

@@ -238,11 +238,14 @@ def all_findings(
 
 def _timed(result: RunData) -> list[Finding]:
     """Findings of the run; when the robot was lifted is as the run judged it, where it did."""
-    lifts = [j for j in episodes(result.decisions, result.trajectory) if j.kind == "lifted"]
-    if not lifts:
-        return list(result.findings)
-    text = f"The robot was lifted or turned by hand, {', '.join(lift.when for lift in lifts)}."
-    return [replace(f, text=text, value=lifts[0].from_s) if f.code == "motion.lifted" else f for f in result.findings]
+    found = list(result.findings)
+    for k, finding in enumerate(found):
+        if finding.code == "motion.lifted":
+            lifts = [j for j in episodes(result.decisions, result.trajectory) if j.kind == "lifted"]
+            if lifts:
+                text = f"The robot was lifted or turned by hand, {', '.join(lift.when for lift in lifts)}."
+                found[k] = replace(finding, text=text, value=lifts[0].from_s)
+    return found
 
 
 def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | None:

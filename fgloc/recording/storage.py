@@ -30,7 +30,7 @@ from fgloc.recording.limits import (
     opening,
 )
 from fgloc.recording.recover import Recovered, recover, sqlite_journals
-from fgloc.types import Grave, Lost
+from fgloc.types import Grave, LostData
 
 # --- metadata.yaml of a rosbag2 folder; hostile contents are refused --------------------------------------------------
 
@@ -109,7 +109,7 @@ EXPECTED = "expected a ROS 1 .bag, a rosbag2 folder, an .mcap or a .db3"
 
 def lost(text: str, share: float) -> str:
     """The note that a share of a recording cannot be read, grave if it is more than a little."""
-    return Lost(text, min(share, 1.0)) if share > _LITTLE else text
+    return LostData(text, min(share, 1.0)) if share > _LITTLE else text
 
 
 def find_beside(bag: Path, name: str) -> Path | None:
@@ -474,7 +474,7 @@ def _salvaged(damage: str, recovered: Recovered, stated: int) -> Grave:
         told += f", {share:.1%} of its bytes are lost"
     if recovered.cut:
         told += "; it ends before its index: if it was cut off, what came after is missing too"
-    return Lost(f"{damage}: {told}.", share) if share > _LITTLE else Grave(f"{damage}: {told}.")
+    return LostData(f"{damage}: {told}.", share) if share > _LITTLE else Grave(f"{damage}: {told}.")
 
 
 def _open(path: Path, kind: str, budget: Budget) -> Any:

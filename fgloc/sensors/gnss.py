@@ -234,7 +234,8 @@ class GnssChecks:
         section: GnssConfig = getattr(config, Gnss.name, GnssConfig())
         if section.origin is None and self._first:
             found.append(
-                f"{topic}: the first positions are at gnss.origin: {_origin(self._first)}, if the map begins there."
+                f"{topic}: to use its positions, set gnss.origin: {_origin(self._first)} (its first ones) if the map "
+                "begins there."
             )
         return found
 

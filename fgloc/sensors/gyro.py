@@ -68,8 +68,7 @@ def imu_validator(checks: FieldChecks) -> Callable[[ImuEvent], Event | str]:
     bounds = checks.config
     repeated: dict[str, tuple[tuple[float, ...], int, int]] = {}  # by topic: values, since when, how often
 
-    def is_frozen(event: ImuEvent) -> bool:
-        values = (*event.angular_velocity.tolist(), *event.linear_acceleration.tolist())
+    def is_frozen(event: ImuEvent, values: tuple[float, ...]) -> bool:
         before, since_ns, times = repeated.get(event.topic, ((), 0, 0))
         same = values == before and event.stamp_ns > since_ns
         repeated[event.topic] = (before, since_ns, times + 1) if same else (values, event.stamp_ns, 1)
@@ -78,7 +77,13 @@ def imu_validator(checks: FieldChecks) -> Callable[[ImuEvent], Event | str]:
 
     def validate(event: ImuEvent) -> Event | str:
         changes: Changes = {}
-        if is_frozen(event):
+        cov = event.angular_velocity_cov
+        if cov[0, 0] == -1.0:  # REP 145
+            checks.note(f"{event.topic}: says that it has no gyroscope (its covariance starts with -1)")
+            return "unavailable"
+        wx, wy, wz = event.angular_velocity.tolist()
+        ax, ay, az = event.linear_acceleration.tolist()
+        if is_frozen(event, (wx, wy, wz, ax, ay, az)):
             checks.note(
                 Grave(
                     f"{event.topic}: rates and accelerations repeat to the digit for more than "
@@ -86,11 +91,6 @@ def imu_validator(checks: FieldChecks) -> Callable[[ImuEvent], Event | str]:
                 )
             )
             return "frozen"
-        cov = event.angular_velocity_cov
-        if cov[0, 0] == -1.0:  # REP 145
-            checks.note(f"{event.topic}: says that it has no gyroscope (its covariance starts with -1)")
-            return "unavailable"
-        wx, wy, wz = event.angular_velocity.tolist()
         if not math.isfinite(wx + wy + wz):
             return "non_finite"
         if max(abs(wx), abs(wy), abs(wz)) > bounds.max_yaw_rate:
@@ -99,7 +99,6 @@ def imu_validator(checks: FieldChecks) -> Callable[[ImuEvent], Event | str]:
             event.topic, "angular velocity", cov, (0, 1, 2), "angular_velocity_cov", changes
         ):
             return reason
-        ax, ay, az = event.linear_acceleration.tolist()
         if not abs(ax) + abs(ay) + abs(az) <= _MAX_ACCELERATION:  # also NaN
             checks.rejections["imu.acceleration"] += 1
             changes["linear_acceleration"] = np.full(3, np.nan)

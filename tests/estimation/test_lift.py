@@ -174,7 +174,7 @@ def test_a_robot_that_stands_and_tilts_is_in_somebodys_hands(forward, told):
 
 
 def test_one_sample_after_a_silence_is_no_lift():
-    """What the IMU measured within a second is in no single message."""
+    """One message does not hold what the IMU measured within a second."""
     rng, monitor = np.random.default_rng(7), LiftMonitor(10.0, np.array([0.0, 0.0, 1.0]))
     calm = [step(k, 9.78 + rng.normal(0.0, 0.1, 20)) for k in range(100)]
     assert not any(alarms(monitor, [(s, readings(s)) for s in calm]))

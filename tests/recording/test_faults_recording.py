@@ -22,7 +22,7 @@ from fgloc.files.documents import HostileError
 from fgloc.recording.reader import open_recording
 from fgloc.recording.recover import recover_mcap
 from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import Grave, Lost, Severity
+from fgloc.types import Grave, LostData, Severity
 
 DEFAULT = RecordingConfig()
 
@@ -41,7 +41,7 @@ def note_of(notes: tuple[str, ...], word: str) -> str:
 
 def lost_share(note: str) -> float:
     assert isinstance(note, Grave)
-    return note.share if isinstance(note, Lost) else 0.0
+    return note.share if isinstance(note, LostData) else 0.0
 
 
 def small_chunks(path: Path, chunk_bytes: int = 8192) -> Path:
