@@ -47,7 +47,6 @@ from fgloc.types import (
 
 _SHAPES: Mapping[str, tuple[tuple[int | None, ...], str]] = {
     "pose": ((3,), "x, y [m] and yaw [rad]"),
-    "sigmas": ((3,), "sigmas of x, y [m] and yaw [rad]"),
     "twist": ((3,), "forward, left [m/s] and yaw rate [rad/s]"),
     "twist_cov": ((3, 3), "covariance of forward, left [m/s] and yaw rate [rad/s]"),
     "v": ((), "forward speed [m/s]"),
@@ -376,9 +375,14 @@ class Live(registry.SensorInput):
         Raises:
             EstimatorError: values that are none, or the run is closed.
         """
-        mean, spread = _numbers("pose", pose, "reset_pose"), _numbers("sigmas", sigmas, "reset_pose")
-        if not (np.isfinite([mean, spread]).all() and (spread > 0.0).all()):
-            raise EstimatorError(f"pose {pose} with sigmas {sigmas}; expected three finite values and sigmas above 0")
+        try:
+            mean, spread = np.asarray(pose, dtype=float), np.asarray(sigmas, dtype=float)
+        except (TypeError, ValueError):
+            mean = spread = np.zeros(0)
+        if not (mean.shape == spread.shape == (3,) and np.isfinite([mean, spread]).all() and (spread > 0.0).all()):
+            raise EstimatorError(
+                f"reset_pose: {pose} with sigmas {sigmas}; expected three finite values and sigmas above 0"
+            )
         self._estimation.reset_pose(PoseWithCovariance(mean, np.diag(spread**2)))
 
     def search(self) -> None:
