@@ -246,11 +246,14 @@ def played(path, config, rate):
             while not ended.wait(0.05):
                 topics.find()
                 topics.subscribe()
+                if topics.roles:
+                    reading.set()
 
-        ended = threading.Event()
+        reading, ended = threading.Event(), threading.Event()
         following = threading.Thread(target=follow)
         following.start()
         try:
+            assert reading.wait(60.0)  # a busy machine takes longer between two readers than a player waits
             assert player.wait_for_readers(60.0)
             player.play(rate)
             player.finish()
