@@ -29,7 +29,7 @@ from benchmarks.live import START_NS, circle, circle_config, circle_map, circle_
 from fgloc.config import Role, TopicsConfig
 from fgloc.live import Live
 from fgloc.recording.messages import Messages
-from fgloc.recording.reader import events_of
+from fgloc.recording.reader import MessageEvents
 from fgloc.sensors.base import with_values
 from fgloc.sensors.range_bearing import RangeBearingEvent
 from fgloc.types import Estimate, Event
@@ -100,7 +100,7 @@ class Hostile:
         try:
             content = self._messages.decode(kind, self._cdr(kind, now_ns))
             self._spoil(content)
-            return events_of(content, kind, role, now_ns, topic, self._config)
+            return MessageEvents(self._config).of(content, kind, role, now_ns, topic)
         except Exception:  # as the wire's intake has it: damaged bytes raise anything
             self.undecodable[topic] += 1
             return []

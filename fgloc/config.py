@@ -417,6 +417,12 @@ class TopicsConfig(Section):
 
     _cameras: dict[Role, str | None] = PrivateAttr(default_factory=dict)
     _asked: frozenset[Role] = PrivateAttr(default=frozenset())
+    _of_joints: tuple[str, ...] = PrivateAttr(default=())
+
+    @property
+    def of_joints(self) -> tuple[str, ...]:
+        """Topics of any type in which `recording.joints` names fields, the first one being that of the role."""
+        return self._of_joints
 
     @property
     def of_cameras(self) -> Mapping[Role, str | None]:
@@ -463,10 +469,39 @@ class OdometryTopic(Section):
         return BESIDE + self.name
 
 
+_FieldPath = Annotated[
+    str, StringConstraints(pattern=r"^[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*$", max_length=200)
+]
+
+
+class JointField(Section):
+    """One joint whose angle or rate is a field of a message of any type."""
+
+    topic: str = Field(min_length=1, description="of any message type")
+    position: _FieldPath | None = Field(None, description="field of the angle: data, point.x, wheels[0].ticks")
+    velocity: _FieldPath | None = Field(None, description="field of the rate")
+    scale: float = Field(
+        1.0, ge=-1e9, le=1e9, description="rad, rad/s or m/s for one unit of the field; negative: it counts backwards"
+    )
+    offset: float = Field(0.0, ge=-1e9, le=1e9, description="added after the scale")
+    rolls_over: float | None = Field(None, gt=0, le=1e19, description="a counter begins anew after it: 65536")
+
+    @model_validator(mode="after")
+    def _measured(self) -> JointField:
+        if self.position is None and self.velocity is None:
+            raise ValueError("it has neither position nor velocity, expected the field of one of them")
+        if not self.scale:
+            raise ValueError("scale is 0, expected the size of the field's unit")
+        return self
+
+
 class RecordingConfig(Section):
     """How to read a recording."""
 
     topics: TopicsConfig = TopicsConfig()
+    joints: dict[str, JointField] = Field(
+        {}, max_length=100, description="joints that come in messages of another type than JointState (docs/drives.md)"
+    )
     odometries: tuple[OdometryTopic, ...] = Field(
         (),
         max_length=8,
@@ -503,6 +538,17 @@ class RecordingConfig(Section):
             given = [getattr(one, what) for one in self.odometries]
             if len(set(given)) < len(given):
                 raise ValueError(f"odometries have the {what}s {', '.join(given)}, expected each once")
+        return self
+
+    @model_validator(mode="after")
+    def _with_topic_of_joints(self) -> RecordingConfig:
+        topics = tuple(dict.fromkeys(joint.topic for joint in self.joints.values()))
+        if topics and self.topics.joints not in (None, *topics):
+            raise ValueError(f"topics.joints is {self.topics.joints}, expected none of it beside recording.joints")
+        if topics:
+            read = self.topics.model_copy(update={"joints": topics[0]})
+            read._of_joints = topics
+            self.__dict__["topics"] = read
         return self
 
     @property

@@ -308,8 +308,8 @@ TELLING_MOTION = _WHEELS | {"imu", "image", "sightings"}
 
 
 CONVERT = (
-    "Motion that is measured in a message of another type has to be converted: speed and steering to "
-    "ackermann_msgs/AckermannDriveStamped (docs/drives.md), velocity and yaw rate to nav_msgs/Odometry."
+    "Wheels whose angles or rates come in messages of another type: name the fields in recording.joints "
+    "(docs/drives.md); velocity and yaw rate have to be converted to nav_msgs/Odometry."
 )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -20,6 +21,7 @@ from fgloc.config import (
     config_of_file,
     one_line,
     optional_roles,
+    role_names,
     with_value,
 )
 from fgloc.diagnosis.comparison import Conventions
@@ -29,9 +31,10 @@ from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
+from fgloc.recording.fields import NumericField, unread_numbers
 from fgloc.recording.info import LACKING, RecordingInfo, inspect_recording, placing_roles
-from fgloc.recording.reader import Recording, is_derived
-from fgloc.recording.storage import find_beside
+from fgloc.recording.reader import TF_TYPES, Recording, converters_of, is_derived
+from fgloc.recording.storage import Storage, find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
 from fgloc.sensors.base import Asked, FirstLook, FirstSection
@@ -105,6 +108,7 @@ class _Seen:
     frames: tuple[str, ...]
     sections: tuple[FirstSection, ...]
     others: Mapping[Role, tuple[str, ...]]  # topics that could each play a role beyond the built-in ones
+    numbers: tuple[NumericField, ...]  # that may be of wheels, where no topic is
 
 
 Ask = Callable[[Asked], Mapping[str, str] | None]
@@ -291,7 +295,18 @@ def _look(bag: Path) -> _Seen:
         _look_at_optional(bag, config, roles.values(), watch)
         look = FirstLook(info.roles, events, recording, has_map, landmark_map)
         frames = tuple(name for name in BASE_NAMES if name in recording.frames)
-        return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted), others)
+        numbers = () if _WHEELED & roles.keys() else tuple(islice(_numbers(bag), _MOST_NUMBERS))
+        return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted), others, numbers)
+
+
+_WHEELED: frozenset[Role] = frozenset({"odometry", "joints", "command"})
+_MOST_NUMBERS = 12  # lines
+
+
+def _numbers(bag: Path) -> Iterator[NumericField]:
+    known = TF_TYPES.union(*map(converters_of, role_names()))
+    with closing(Storage(bag)) as storage:
+        yield from unread_numbers(storage, known)
 
 
 _MOST_OPTIONAL = 500  # messages of such a topic
@@ -374,6 +389,12 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
         missing.append(f"which topic is the {role}: {first} is taken, {', '.join(rest)} could be it too")
     for problem in seen.info.problems:
         yield f"    # to be settled: {problem}"
+    if seen.numbers:
+        yield "  # Fields that may be wheels' angles (position) or rates (velocity); fill in what is (docs/drives.md):"
+        yield "  # joints:"
+    for n in seen.numbers:
+        kind = "velocity" if n.is_rate else "position"
+        yield f"  #   NAME: {{topic: {n.topic}, {kind}: {n.path}, scale: 1.0}}  # {n.low:.4g} to {n.high:.4g}"
     if seen.frames:
         yield f"  base_frame: {seen.frames[0]}"
     else:

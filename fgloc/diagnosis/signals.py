@@ -318,7 +318,7 @@ def read_signals(recording: Recording, config: Config) -> Signals:
 
 def take(recording: Recording, roles: Collection[Role], add: Callable[[Event], bool]) -> None:
     """Pass the events of some roles to a collector, until it wants no more of them."""
-    role_of = {recording.roles[role]: role for role in roles}
+    role_of = {topic: role for topic, role in recording.role_of.items() if role in roles}
     for message in recording.messages(role_of.keys()):
         if not all(map(add, recording.decode(message, role_of[message[0]]))):
             return

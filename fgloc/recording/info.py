@@ -352,7 +352,7 @@ def _read_through(
 ) -> tuple[dict[str, Times], dict[str, Collector], str]:
     """Times and checks of each topic, and the first name of a child frame."""
     times = {topic.name: Times() for topic in recording.topics}
-    role_of = {topic: role for role, topic in recording.roles.items()}
+    role_of = recording.role_of
     checks: dict[str, Collector] = {topic: collector(role) for topic, role in role_of.items()}
     child_frame = ""
     recording.undecodable = {}

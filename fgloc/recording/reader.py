@@ -25,6 +25,7 @@ from fgloc.config import (
     role_names,
 )
 from fgloc.errors import RecordingError
+from fgloc.recording.fields import JointFields, numeric_fields
 from fgloc.recording.messages import Decoder
 from fgloc.recording.storage import RawMessage, Storage, lost
 from fgloc.recording.transforms import FrameTree
@@ -61,22 +62,31 @@ def transforms(message: Any, received_ns: int, topic: str, static: bool) -> list
     ]
 
 
-def events_of(
-    content: Any, message_type: str, role: Role | None, received_ns: int, topic: str, config: RecordingConfig
-) -> list[Event]:
-    """Events of one message in a role (None: none but that of tf), stamped as the configuration has it.
+class MessageEvents:
+    """Turns messages into events; keeps what joints on several topics wait for."""
 
-    Raises:
-        KeyError, ValueError, AttributeError: the message is not what its type says.
-    """
-    if message_type in TF_TYPES:
-        return list(transforms(content, received_ns, topic, topic.rstrip("/").endswith("tf_static")))
-    if role is None:
-        return []
-    stamp_ns = None if role in config.received_stamps else header_stamp(content)
-    stamp_ns = received_ns if stamp_ns is None else stamp_ns
-    stamp_ns += round(config.stamp_offset_s.get(role, 0.0) * 1e9)
-    return [converters_of(role)[message_type](content, (stamp_ns, received_ns, topic))]
+    def __init__(self, config: RecordingConfig) -> None:
+        """Take topics and clocks."""
+        self._config = config
+        self._fields = JointFields(config.joints)
+
+    def of(self, content: Any, message_type: str, role: Role | None, received_ns: int, topic: str) -> list[Event]:
+        """Events of one message in a role (None: none but that of tf), stamped as the configuration has it.
+
+        Raises:
+            KeyError, ValueError, AttributeError, IndexError, TypeError: the message is not what its type says, or
+                lacks a configured field.
+        """
+        if message_type in TF_TYPES:
+            return list(transforms(content, received_ns, topic, topic.rstrip("/").endswith("tf_static")))
+        if role is None:
+            return []
+        stamp_ns = None if role in self._config.received_stamps else header_stamp(content)
+        stamp_ns = received_ns if stamp_ns is None else stamp_ns
+        stamp_ns += round(self._config.stamp_offset_s.get(role, 0.0) * 1e9)
+        if topic in self._fields.topics:
+            return self._fields.events(content, (stamp_ns, received_ns, topic))
+        return [converters_of(role)[message_type](content, (stamp_ns, received_ns, topic))]
 
 
 # --- One converter for each type --------------------------------------------------------------------------------------
@@ -229,12 +239,16 @@ def _given_roles(
             continue
         if role in config.of_cameras and given not in filled and seeing:
             notes.append(f"{topic_key(role)}: {given} has no messages; the run goes on without it.")
+        elif role == "joints" and given in config.of_joints:
+            roles[role] = given
         elif problem := _misfit(role, given, topics):
             problems.append(problem)
         elif given in roles.values():
             problems.append(f"{topic_key(role)}: {given} is given for another role too; choose one of them")
         else:
             roles[role] = given
+    lacking = [topic for topic in config.of_joints if topic not in filled and not (growing and topic not in there)]
+    problems += [f"recording.joints: {topic} is not in the recording, or has no messages" for topic in lacking]
     if len(problems) > 1 and not roles:
         problems.append(
             "no topic of the configuration fits: if it is another robot's, `fgloc init BAG` writes this one's"
@@ -420,15 +434,21 @@ class Recording:
         selection = select_roles(tuple(found.values()), config.topics, config.beside)
         self.roles: Mapping[Role, str] = selection.roles
         self.problems = selection.problems
-        role_of: dict[str, Role] = {topic: role for role, topic in selection.roles.items()}
-        self.topics = tuple(replace(topic, role=role_of.get(topic.name)) for topic in found.values())
+        self.role_of: Mapping[str, Role] = {
+            **dict.fromkeys(config.topics.of_joints, "joints"),
+            **{topic: role for role, topic in selection.roles.items()},
+        }
+        self.topics = tuple(replace(topic, role=self.role_of.get(topic.name)) for topic in found.values())
         known_types = TF_TYPES.union(*map(converters_of, role_names()))
+        known_types |= {t.message_type for t in self.topics if t.name in config.topics.of_joints}
         self._decoder = Decoder(
             self.kind == "ros1",
             [(c.message_type, c.definition) for c in channels if c.message_type in known_types and c.count],
         )
         self._notes = (*selection.notes, *self._decoder.notes)
         self.undecodable: dict[str, int] = {}
+        self._events = MessageEvents(config)
+        self.problems = (*self.problems, *self._lacking_fields())
 
     def __enter__(self) -> Recording:
         return self
@@ -489,12 +509,28 @@ class Recording:
         """Messages of these topics (None: of all), serialized, in order of receive time."""
         return self._storage.messages(topics)
 
+    def _lacking_fields(self) -> Iterator[str]:
+        """Sentences on joints whose field the topic's messages do not have."""
+        types = {topic.name: topic.message_type for topic in self.topics}
+        for name, joint in self.config.joints.items():
+            if joint.topic not in types:
+                continue
+            there = [*numeric_fields(types[joint.topic], self._decoder.store.fielddefs)]
+            plain = {re.sub(r"\[\d+\]", "[0]", field) for field in there}
+            for key in ("position", "velocity"):
+                field = getattr(joint, key)
+                if field is not None and re.sub(r"\[\d+\]", "[0]", field) not in plain:
+                    yield (
+                        f"recording.joints.{name}.{key}: {joint.topic} ({types[joint.topic]}) has no number {field}, "
+                        f"expected one of {', '.join(there) or 'none: the recording does not hold its definition'}"
+                    )
+
     def decode(self, message: RawMessage, role: Role | None) -> list[Event]:
         """Events of one message in a role (None: tf); empty, and counted, if it cannot be decoded."""
         topic, message_type, received_ns, raw = message
         try:
             content = self._decoder.deserialize(message_type, raw)
-            return events_of(content, message_type, role, received_ns, topic, self.config)
+            return self._events.of(content, message_type, role, received_ns, topic)
         except Exception:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
             self.undecodable[topic] = self.undecodable.get(topic, 0) + 1
             return []

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from recording_bags import storage_file, write_drive, write_ros1
+from recording_bags import SIDES, storage_file, two_topics, write_drive, write_ros1
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 from wire import DOMAIN, wait_until
@@ -283,6 +283,17 @@ def test_events_of_a_recording_arrive_as_they_are(tmp_path, kind):
     assert sorted(map(told, events)) == sorted(expected)
     assert not player.notes
     assert player.damaged == 0
+
+
+def test_joints_of_two_topics_arrive_as_they_are(tmp_path):
+    topics = {"image": "none", "sightings": "none"}
+    config = RecordingConfig.model_validate({"joints": SIDES, "topics": topics})
+    path = two_topics(tmp_path / "run", 5.0)
+    events, _ = played(path, config, rate=5.0)
+    with open_recording(path, config) as recording:
+        expected = [told(event) for event in recording.events()]
+    assert len(expected) > 190
+    assert [*map(told, events)] == expected
 
 
 def test_timing_is_the_recorded_one(tmp_path):

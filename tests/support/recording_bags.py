@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
+from fgloc.recording.messages import Messages
 from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
@@ -87,3 +89,44 @@ def write_ros1(path: Path, n: int = 100, chunk_bytes: int = 4096) -> Path:
                 raw = store.serialize_ros1(message, connections[topic].msgtype)
                 writer.write(connections[topic], received, raw)
     return path
+
+
+COUNTS = "std_msgs/msg/Int32"
+OWN = "own_msgs/msg/Wheels"
+ROLL = 65536
+PER_TICK = 0.001  # rad
+
+
+def write_messages(path, messages, own=""):
+    """A rosbag2 of ``(topic, type, received_ns, content)``; ``own``: the definition of `OWN`."""
+    store, encoding = get_typestore(Stores.ROS2_HUMBLE), Messages()
+    with Writer(path, version=9) as writer:
+        connections = {}
+        for topic, kind, at_ns, content in sorted(messages, key=lambda m: m[2]):
+            if (topic, kind) not in connections:
+                more = {"msgdef": own, "rihs01": "RIHS01_" + "0" * 64} if kind == OWN else {"typestore": store}
+                connections[topic, kind] = writer.add_connection(topic, kind, **more)
+            cdr = content if kind == OWN else encoding.encode(kind, content)
+            writer.write(connections[topic, kind], at_ns, cdr)
+    return path
+
+
+def ticks(t, speed):
+    """Counter of a wheel that turns with this rate [rad/s], as an unsigned number of 16 bits."""
+    return round(60000 + speed * t / PER_TICK) % ROLL
+
+
+def two_topics(path, seconds=10.0):
+    """The left wheel's ticks at 20 Hz and the right one's 20 ms later."""
+    left = [("/left", COUNTS, START_NS + k * 50_000_000, {"data": ticks(0.05 * k, 5.0)}) for k in range(200)]
+    right = [
+        ("/right", COUNTS, START_NS + k * 50_000_000 + 20_000_000, {"data": ticks(0.05 * k + 0.02, -6.0)})
+        for k in range(200)
+    ]
+    return write_messages(path, [m for m in left + right if m[2] <= START_NS + seconds * 1e9])
+
+
+SIDES = {
+    "left": {"topic": "/left", "position": "data", "scale": PER_TICK, "rolls_over": ROLL},
+    "right": {"topic": "/right", "position": "data", "scale": -PER_TICK, "rolls_over": ROLL},
+}

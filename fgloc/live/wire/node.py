@@ -21,7 +21,7 @@ from fgloc.live.process import EstimationProcess
 from fgloc.live.run import LOOK, MOTION
 from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, odom_in_map
 from fgloc.live.wire.transport import Clock, Publication, Received, Transport
-from fgloc.recording.reader import TF_TYPES, TopicInfo, events_of, select_roles, topic_key
+from fgloc.recording.reader import TF_TYPES, MessageEvents, TopicInfo, select_roles, topic_key
 from fgloc.recording.standard_messages import MAP_FRAME
 from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Severity
 
@@ -51,6 +51,7 @@ class Intake:
         self._clock = clock
         self._config = config
         self._push = push
+        self._events = MessageEvents(config)
         self._role_of: dict[str, Role | None] = {}
         self._also: set[str] = set()  # latched topics that are read from publishers that do not latch, too
         self._found: tuple[Publication, ...] = ()
@@ -98,7 +99,8 @@ class Intake:
             if is_new and self._transport.has_volatile(topic):
                 self._also.add(topic)
                 self._transport.read(topic, types[topic], self._on_message)
-        new = [(role, topic) for role, topic in self.roles.items() if topic not in self._role_of and topic in types]
+        wanted = [*self.roles.items(), *(("joints", topic) for topic in self._config.topics.of_joints if self.roles)]
+        new = [(role, topic) for role, topic in wanted if topic not in self._role_of and topic in types]
         new = [(role, topic) for role, topic in new if self.truth or role != "truth"]
         for role, topic in new:
             self._role_of[topic] = role
@@ -133,7 +135,7 @@ class Intake:
         try:
             content = self._transport.decode(message)
             role, received_ns = self._role_of[topic], self._clock.received_ns(message)
-            events = events_of(content, message.message_type, role, received_ns, topic, self._config)
+            events = self._events.of(content, message.message_type, role, received_ns, topic)
         except Exception:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
             with self._counting:
                 self.undecodable[topic] += 1

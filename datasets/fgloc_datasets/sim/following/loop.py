@@ -29,7 +29,7 @@ from fgloc.errors import ConfigError, EstimatorError
 from fgloc.files.atomic import atomic_folder
 from fgloc.files.settings import sentences
 from fgloc.live import Live
-from fgloc.recording.reader import events_of
+from fgloc.recording.reader import MessageEvents
 from fgloc.sensors.failures import Failure
 from fgloc.sensors.failures import Scene as FailureScene
 from fgloc.sensors.markers.images import CornersEvent, ImageEvent
@@ -463,7 +463,7 @@ class Arrivals:
 
     def __init__(self, config: Config) -> None:
         """Start without messages."""
-        self._config = config.recording
+        self._events = MessageEvents(config.recording)
         self._queue: list[tuple[int, int, Event]] = []
         self._order = count()
 
@@ -472,7 +472,7 @@ class Arrivals:
         role = ROLES.get(topic)
         if role is None and not topic.startswith("/tf"):
             return
-        for event in events_of(content, message_type, role, received_ns, topic, self._config):
+        for event in self._events.of(content, message_type, role, received_ns, topic):
             if isinstance(event, ImageEvent | CornersEvent):
                 event = replace(event, received_ns=received_ns + round(1e9 * PROCESSING_S))
             heapq.heappush(self._queue, (event.received_ns, next(self._order), event))

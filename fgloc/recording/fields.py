@@ -1,0 +1,200 @@
+"""Joints in messages of any type: which field holds which angle or rate, and several topics put together."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from fgloc.config import JointField
+from fgloc.recording.messages import Decoder
+from fgloc.recording.storage import Storage
+from fgloc.sensors import registry
+from fgloc.sensors.base import When
+from fgloc.types import Event, FloatArray
+
+_STEP = re.compile(r"(\w+)|\[(\d+)\]")
+_RATE = re.compile(r"speed|vel(ocity)?(?![a-z])|rpm|rate", re.IGNORECASE)
+_ANGLE = re.compile(r"steer|angle|tick|count|encoder|position", re.IGNORECASE)
+_MOST_FIELDS = 12  # of a message that tells of wheels: more is a status or a scan
+_MOST_LOOKED_AT = 5000  # messages
+_JOINT_STATE = "sensor_msgs/msg/JointState"
+_MOST_WAITING = 2000  # readings of a topic that wait for those of the others
+_AGAIN_NS = 1_000_000_000  # a message received so much before the last one: the recording is read again
+_DEEPEST = 8  # messages inside messages
+
+
+def value_at(content: Any, path: str) -> float:
+    """Number in a message, by its path, such as ``point.x`` or ``data[0]``.
+
+    Raises:
+        AttributeError, IndexError, TypeError, ValueError: there is none.
+    """
+    for name, index in _STEP.findall(path):
+        content = getattr(content, name) if name else content[int(index)]
+    return float(content)
+
+
+def numeric_fields(message_type: str, definitions: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
+    """Paths of the numbers in a message type, as `value_at` reads them; of an array that of its first element.
+
+    Args:
+        message_type: "pkg/msg/Name".
+        definitions: fields of it and of the types inside it, as rosbags' typestore has them.
+        depth: of this message in others.
+    """
+    if message_type not in definitions or depth > _DEEPEST:
+        return
+    for name, (kind, content) in definitions[message_type][1]:
+        if name == "header":
+            continue
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            name, (kind, content) = f"{name}[0]", content[0]
+        if kind == Nodetype.NAME:
+            yield from (f"{name}.{inner}" for inner in numeric_fields(content, definitions, depth + 1))
+        elif kind == Nodetype.BASE and content[0] not in ("string", "wstring"):
+            yield name
+
+
+@dataclass(frozen=True, slots=True)
+class NumericField:
+    """One number of a topic's messages, with the range of its first values."""
+
+    topic: str
+    path: str
+    low: float
+    high: float
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether its name or its topic's says that it is one, and not an angle."""
+        name = f"{self.topic} {self.path}"
+        return bool(_RATE.search(name)) and not _ANGLE.search(name)
+
+
+def unread_numbers(storage: Storage, known: Collection[str]) -> Iterator[NumericField]:
+    """Numbers in the messages of types that nothing reads: they may be the angles or rates of wheels.
+
+    Args:
+        storage: of the recording.
+        known: types that something reads.
+    """
+    channels = [c for c in storage.channels if c.count and c.message_type not in known]
+    decoder = Decoder(storage.kind == "ros1", [(c.message_type, c.definition) for c in channels])
+    for channel in channels:
+        paths = [*numeric_fields(channel.message_type, decoder.store.fielddefs)]
+        if not 0 < len(paths) <= _MOST_FIELDS:
+            continue
+        seen: dict[str, list[float]] = {path: [] for path in paths}
+        for _, message_type, _, raw in islice(storage.messages([channel.topic]), _MOST_LOOKED_AT):
+            with suppress(Exception):  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
+                content = decoder.deserialize(message_type, raw)
+                for path in paths:
+                    with suppress(IndexError):  # an array may be empty
+                        seen[path].append(value_at(content, path))
+        for path, values in seen.items():
+            if values:
+                yield NumericField(channel.topic, path, min(values), max(values))
+
+
+class JointFields:
+    """Makes joint states of the fields that `recording.joints` names.
+
+    Joints of one topic make an event for each message. Those of several make one for each time that all topics have
+    reached: the readings before and after it are interpolated.
+    """
+
+    def __init__(self, joints: Mapping[str, JointField]) -> None:
+        """Take the joints by name; the events are of the first one's topic."""
+        self._joints = joints
+        self._names = tuple(joints)
+        self.topics = tuple(dict.fromkeys(joint.topic for joint in joints.values()))
+        self._received_ns = self._made_ns = -1
+        self._columns = {topic: [k for k, j in enumerate(joints.values()) if j.topic == topic] for topic in self.topics}
+        self._forget()
+
+    def events(self, content: Any, when: When) -> list[Event]:
+        """Events that a message completes.
+
+        Args:
+            content: the message.
+            when: its stamp, receive time and topic.
+
+        Raises:
+            AttributeError, IndexError, TypeError, ValueError: it lacks a field, or one is no number.
+        """
+        stamp_ns, received_ns, topic = when
+        if received_ns < self._received_ns - _AGAIN_NS:
+            self._forget()
+        self._received_ns = received_ns
+        values = self._read(content, topic)
+        if len(self.topics) == 1:
+            return [self._event(values, when)]
+        waiting = self._waiting[topic]
+        if waiting and stamp_ns <= waiting[-1][0]:  # late, or its clock was set back
+            waiting.clear()
+        waiting.append((stamp_ns, values))
+        if not all(self._waiting.values()):
+            return []
+        reached_ns = min(readings[-1][0] for readings in self._waiting.values())
+        found = {name: self._at(readings, reached_ns) for name, readings in self._waiting.items()}
+        if reached_ns == self._made_ns or any(value is None for value in found.values()):
+            return []
+        self._made_ns = reached_ns
+        whole = np.full((2, len(self._names)), math.nan)
+        for name, at in found.items():
+            whole[:, self._columns[name]] = at[:, self._columns[name]]  # type: ignore[index]
+        return [self._event(whole, (reached_ns, received_ns, self.topics[0]))]
+
+    def _forget(self) -> None:
+        self._received_ns = self._made_ns = -1
+        self._waiting: dict[str, deque[tuple[int, FloatArray]]] = {
+            topic: deque(maxlen=_MOST_WAITING) for topic in self.topics
+        }
+        self._counts: dict[str, tuple[float, float]] = {}  # the last reading and its turns, of what rolls over
+
+    def _read(self, content: Any, topic: str) -> FloatArray:
+        """Angles and rates ``(2, n)`` of all joints; NaN where this message has none."""
+        values = np.full((2, len(self._names)), math.nan)
+        for k in self._columns[topic]:
+            joint = self._joints[self._names[k]]
+            if joint.position is not None:
+                told = value_at(content, joint.position)
+                if joint.rolls_over is not None and math.isfinite(told):
+                    told = self._unrolled(self._names[k], told, joint.rolls_over)
+                values[0, k] = joint.scale * told + joint.offset
+            if joint.velocity is not None:
+                values[1, k] = joint.scale * value_at(content, joint.velocity)
+                if joint.position is None:
+                    values[1, k] += joint.offset
+        return values
+
+    def _unrolled(self, name: str, told: float, after: float) -> float:
+        last, whole = self._counts.get(name, (told, told))
+        whole += math.remainder(told - last, after)
+        self._counts[name] = told, whole
+        return whole
+
+    def _at(self, readings: deque[tuple[int, FloatArray]], at_ns: int) -> FloatArray | None:
+        """Values at a time between two readings; those before it are dropped. None: it is before the first one."""
+        while len(readings) > 1 and readings[1][0] <= at_ns:
+            readings.popleft()
+        (first_ns, first), (last_ns, last) = readings[0], readings[min(1, len(readings) - 1)]
+        if first_ns > at_ns:
+            return None
+        share = 0.0 if last_ns == first_ns else (at_ns - first_ns) / (last_ns - first_ns)
+        return first if share == 0.0 else first + share * (last - first)
+
+    def _event(self, values: FloatArray, when: When) -> Event:
+        position, velocity = (row if np.isfinite(row).any() else np.empty(0) for row in values)
+        message = SimpleNamespace(name=self._names, position=position, velocity=velocity, effort=np.empty(0))
+        return registry.converters("joints")[_JOINT_STATE](message, when)
