@@ -403,7 +403,7 @@ def evaluate(
 
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
     matched = match(read_tum(estimate), read_tum(truth), kind, max_gap)
-    drift, relative = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0, "m")
+    drift, relative = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0)
     rows = [
         ("poses matched", f"{len(matched.stamps_ns)}"),
         ("ATE mean", f"{metrics.ate_mean_m(matched):.6f} m"),
