@@ -68,6 +68,12 @@ class Run:
     key: str
     record: Record
 
+    @property
+    def row(self) -> dict[str, Any]:
+        """Its place in the suite, as tables have it."""
+        names = ("recording", "failure", "severity", "variant", "seed")
+        return {"key": self.key} | {name: getattr(self.cell, name) for name in names}
+
 
 @dataclass(frozen=True, slots=True)
 class Entry:
@@ -96,7 +102,7 @@ class Entry:
         mean, spread, n = self.mean, self.spread, len(self.values)
         if mean is None or spread is None:
             return None
-        half = float(stats.t.ppf(0.975, n - 1)) * spread / math.sqrt(n)
+        half = _half_width(spread, n)
         return mean - half, mean + half
 
     @property
@@ -109,6 +115,26 @@ class Entry:
             shown = " ± ".join(rounded(self.mean, self.spread))
         count = f"{len(self.values)}" if len(self.values) == self.runs else f"{len(self.values)} of {self.runs}"
         return f"{shown} ({count})"
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The figure, as tables have it."""
+        return {
+            "failure": self.failure,
+            "severity": self.severity,
+            "variant": self.variant,
+            "figure": self.metric.label,
+            "mean": self.mean,
+            "spread": self.spread,
+            "interval_95": self.interval,
+            "n": len(self.values),
+            "runs": self.runs,
+        }
+
+
+def _half_width(spread: float, n: int) -> float:
+    """Half of the 95 % confidence interval of a mean of ``n`` values (Student's t)."""
+    return float(stats.t.ppf(0.975, n - 1)) * spread / math.sqrt(n)
 
 
 def join(jobs: Iterable[Job], records: Mapping[str, Record]) -> list[Run]:
@@ -140,13 +166,19 @@ def select(runs: Iterable[Run], failure: str, severity: float | None, variant: s
     return [run for run in runs if (run.cell.failure, run.cell.severity, run.cell.variant) == wanted]
 
 
+def _with_unit(suite: Suite, failure: str, severity: float | None) -> str:
+    """A severity with its unit; empty where the failure has none."""
+    units = {f.name: f.severity.unit for f in suite.failures if f.severity is not None}
+    return "" if severity is None else f"{severity:g} {units[failure]}".rstrip()
+
+
 def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     """Sentence: error that a failure costs the first variant at its last severity, by pairs of runs."""
     entry = next(f for f in suite.failures if f.name == failure)
     severity = list(entry.severities())[-1][0]
     variant = suite.variants[0].name
     here = select(runs, failure, severity, variant)
-    at = "" if entry.severity is None else f" at {severity:g} {entry.severity.unit}".rstrip()
+    at = "" if severity is None else f" at {_with_unit(suite, failure, severity)}"
     name = failure[0].upper() + failure[1:]
     if not any(run.record.affected for run in here if run.record.outcome == "done") and all(
         run.record.outcome == "done" for run in here
@@ -186,8 +218,7 @@ def _measurable(pairs: Sequence[tuple[float, float]]) -> bool:
         return True
     more, n = np.diff(pairs), len(pairs)
     spread = float(more.std(ddof=1))
-    by_chance = float(stats.t.ppf(0.975, n - 1)) * spread / math.sqrt(n)
-    return abs(float(more.mean())) > min(spread, by_chance)
+    return abs(float(more.mean())) > min(spread, _half_width(spread, n))
 
 
 def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
@@ -214,8 +245,7 @@ def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
         return None
     plain = next((f for f in found if f[2] == NOTHING), None)
     measurable, ratio, failure, severity, ours, other, n = max(found, key=lambda f: f[:2])
-    units = {f.name: f.severity.unit for f in suite.failures if f.severity is not None}
-    at = "" if severity is None else f" at {severity:g} {units.get(failure, '')}".rstrip()
+    at = "" if severity is None else f" at {_with_unit(suite, failure, severity)}"
     under = "without failure" if failure == NOTHING else f"under '{failure}'{at}"
     count = f"{n} run{'s' if n > 1 else ''}"
     if not measurable:
@@ -247,46 +277,21 @@ def worst(suite: Suite, runs: Sequence[Run], failure: str) -> Run | None:
 def matrix_csv(entries: Iterable[Entry]) -> str:
     """The matrix, one figure a row, in the units that the labels name."""
     head = ("failure", "severity", "variant", "figure", "mean", "spread", "low_95", "high_95", "n", "runs")
-    out = [
-        (
-            e.failure,
-            e.severity,
-            e.variant,
-            e.metric.label,
-            e.mean,
-            e.spread,
-            *(e.interval or (None, None)),
-            len(e.values),
-            e.runs,
-        )
-        for e in entries
-    ]
-    return _csv(head, out)
+    ends = ("low_95", "high_95")
+    return _csv(head, (e.row | dict(zip(ends, e.interval or (None, None), strict=True)) for e in entries))
 
 
-def runs_csv(runs: Iterable[Run]) -> str:
+def runs_csv(runs: Sequence[Run]) -> str:
     """Every run with its figures, in the units that the labels name."""
     head = ("recording", "failure", "severity", "variant", "seed", "outcome", *(m.label for m in METRICS), "key")
-    out = [
-        (
-            run.cell.recording,
-            run.cell.failure,
-            run.cell.severity,
-            run.cell.variant,
-            run.cell.seed,
-            run.record.outcome,
-            *(metric.of(run.record) for metric in METRICS),
-            run.key,
-        )
-        for run in runs
-    ]
-    return _csv(head, out)
+    figures = ({m.label: m.of(run.record) for m in METRICS} for run in runs)
+    return _csv(head, (run.row | {"outcome": run.record.outcome} | own for run, own in zip(runs, figures, strict=True)))
 
 
-def _csv(head: Sequence[str], content: Iterable[Sequence[object]]) -> str:
+def _csv(head: Sequence[str], content: Iterable[Mapping[str, object]]) -> str:
     buffer = io.StringIO()
-    table = csv.writer(buffer, lineterminator="\n")
-    table.writerow(head)
+    table = csv.DictWriter(buffer, head, extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
     table.writerows(content)
     return buffer.getvalue()
 
@@ -300,22 +305,12 @@ FEWEST_FOR_BAND = 5  # runs: of fewer each is drawn, as an interval would say mo
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
-    """A mean at one severity, with its interval if there is one, and the values of the runs."""
-
-    severity: float
-    mean: float
-    interval: tuple[float, float] | None
-    values: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Curves:
     """One small plot: error over the severity of a failure, one curve per variant."""
 
     title: str
     unit: str
-    curves: Mapping[str, Sequence[Point]]
+    curves: Mapping[str, Sequence[Entry]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +324,7 @@ class Tracks:
 
 def plot_failures(suite: Suite, entries: Sequence[Entry]) -> Figure:
     """Error of each failure, one below the other, by variant: mean, and every run as a dot; logarithmic."""
-    shown = [(name, severity, _row_label(suite, name, severity)) for name, severity in rows(suite)]
+    shown = [(name, severity, f"{name} {_with_unit(suite, name, severity)}".rstrip()) for name, severity in rows(suite)]
     names = [variant.name for variant in suite.variants]
     height = (0.09 + 0.09 * len(names)) * len(shown) + 0.6 + 0.18 * math.ceil(len(names) / 3)
     figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
@@ -360,11 +355,6 @@ def plot_failures(suite: Suite, entries: Sequence[Entry]) -> Figure:
     return figure
 
 
-def _row_label(suite: Suite, failure: str, severity: float | None) -> str:
-    units = {f.name: f.severity.unit for f in suite.failures if f.severity is not None}
-    return failure if severity is None else f"{failure} {severity:g} {units[failure]}".rstrip()
-
-
 def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
     """Small plots side by side, all with one meaning of color.
 
@@ -386,16 +376,9 @@ def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
     return figure
 
 
-def _draw_curve(axes: Axes, name: str, points: Sequence[Point], color: str) -> None:
-    axes.plot(
-        [p.severity for p in points],
-        [p.mean for p in points],
-        "o-",
-        color=color,
-        lw=1.3,
-        ms=3.5,
-        label=plain_label(name),
-    )
+def _draw_curve(axes: Axes, name: str, points: Sequence[Entry], color: str) -> None:
+    means = np.array([(p.severity, p.mean) for p in points], dtype=float).T
+    axes.plot(*means, "o-", color=color, lw=1.3, ms=3.5, label=plain_label(name))
     banded = [(p.severity, *p.interval) for p in points if p.interval and len(p.values) >= FEWEST_FOR_BAND]
     if banded:
         severity, low, high = np.array(banded).T
@@ -528,30 +511,9 @@ def _as_json(
         **provenance,
         "sentences": list(sentences),
         "variants": list(worths),
-        "matrix": [
-            {
-                "failure": e.failure,
-                "severity": e.severity,
-                "variant": e.variant,
-                "figure": e.metric.label,
-                "mean": e.mean,
-                "spread": e.spread,
-                "interval_95": e.interval,
-                "n": len(e.values),
-                "runs": e.runs,
-            }
-            for e in entries
-        ],
+        "matrix": [e.row for e in entries],
         "runs": [
-            {
-                "key": run.key,
-                "recording": run.cell.recording,
-                "failure": run.cell.failure,
-                "severity": run.cell.severity,
-                "variant": run.cell.variant,
-                "seed": run.cell.seed,
-                **run.record.model_dump(mode="json", include={"outcome", "error", "figures", "modes", "affected"}),
-            }
+            run.row | run.record.model_dump(mode="json", include={"outcome", "error", "figures", "modes", "affected"})
             for run in runs
         ],
     }
@@ -597,7 +559,6 @@ def _worths(suite: Suite, runs: Sequence[Run]) -> list[str]:
 
 
 def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> list[tuple[str, ...]]:
-    units = {f.name: f.severity.unit if f.severity is not None else "" for f in suite.failures}
     fixed = str.maketrans({" ": "\u00a0"})  # a line breaks before the number of runs only
     texts = {}
     for e in entries:
@@ -605,11 +566,7 @@ def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> list[tuple[str,
             figure, _, count = e.text.rpartition(" (")
             texts[e.failure, e.severity, e.variant] = f"{figure.translate(fixed)} ({count.translate(fixed)}"
     return [
-        (
-            failure,
-            "" if severity is None else f"{severity:g} {units[failure]}".rstrip(),
-            *(texts[failure, severity, variant.name] for variant in suite.variants),
-        )
+        (failure, _with_unit(suite, failure, severity), *(texts[failure, severity, v.name] for v in suite.variants))
         for failure, severity in rows(suite)
     ]
 
@@ -619,11 +576,10 @@ def _curves(suite: Suite, entries: Sequence[Entry]) -> list[Curves]:
     for failure in suite.failures:
         if failure.severity is None or len(failure.severity.values) < 2:
             continue
-        points: dict[str, list[Point]] = {}
+        points: dict[str, list[Entry]] = {}
         for e in entries:
-            mean = e.mean
-            if (e.failure, e.metric) == (failure.name, ATE) and mean is not None and e.severity is not None:
-                points.setdefault(e.variant, []).append(Point(e.severity, mean, e.interval, e.values))
+            if (e.failure, e.metric) == (failure.name, ATE) and e.values:
+                points.setdefault(e.variant, []).append(e)
         if points:
             plots.append(Curves(failure.name, failure.severity.axis, points))
     return plots

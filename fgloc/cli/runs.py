@@ -35,7 +35,6 @@ from fgloc.cli.terminal import (
     EXIT_LOST,
     exit_code,
     exit_unless_trusted,
-    jobs_bar,
     kept_on_interrupt,
     number,
     run_bar,
@@ -246,7 +245,7 @@ def ablate(
     jobs = make_jobs(expand(plan, suite.parent))
     kept = f"finished runs are kept in {out}; the same command goes on with the others"
     with only_sweep(out):
-        with kept_on_interrupt(kept), jobs_bar("runs") as show:
+        with kept_on_interrupt(kept), run_bar("runs", "") as show:
             records = sweep(jobs, out, workers, scheduler, retry, show)
         sentences = write_report(plan, jobs, records, out, typed(), forms)
     for sentence in sentences:
@@ -276,7 +275,7 @@ def smooth_many(
         configured(bags[0], config_file, model)  # a wrong one is wrong for all
     plan = plan_bags(bags, map_file, lambda bag: configured(bag, config_file, model), typed())
     kept = f"finished bags are kept in {out}; the same command goes on with the others"
-    with kept_on_interrupt(kept), only_sweep(out), jobs_bar("bags") as show:
+    with kept_on_interrupt(kept), only_sweep(out), run_bar("bags", "") as show:
         records = sweep(plan.jobs, out, workers, scheduler, retry=True, progress=show)
     by_name = {name: records[job.key] for job in plan.jobs if (name := job.folder) is not None}
     head = ("", "duration", "keyframes", "ATE mean", "yaw MAE", "NEES/3", "LOST")
@@ -403,7 +402,7 @@ def evaluate(
 
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
     matched = match(read_tum(estimate), read_tum(truth), kind, max_gap)
-    drift, relative = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0, "m")
+    drift, relative = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0)
     rows = [
         ("poses matched", f"{len(matched.stamps_ns)}"),
         ("ATE mean", f"{metrics.ate_mean_m(matched):.6f} m"),

@@ -266,19 +266,10 @@ def shown() -> Iterator[None]:
 
 
 @contextmanager
-def run_bar(label: str) -> Iterator[Progress]:
-    """Progress bar of one recording: yields a function of the seconds done and the length [s]."""
+def run_bar(label: str, unit: str = "s") -> Iterator[Progress]:
+    """Progress bar of one recording, or of what else is counted: yields a function of how much is done, and of all."""
     try:
-        yield lambda done_s, length_s: tell(label, done_s, length_s, "s")
-    finally:
-        end(label)
-
-
-@contextmanager
-def jobs_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Progress bar of a sweep: yields a function of the number of jobs done and in total."""
-    try:
-        yield lambda done, total: tell(label, done, total)
+        yield lambda done, total: tell(label, done, total, unit)
     finally:
         end(label)
 

@@ -108,10 +108,7 @@ class PoseFit:
         if len(self._cov):
             P = self._cov[stack.columns[:, :, None], stack.columns[:, None, :]]
             cov = cov + stack.H @ P @ stack.H.transpose(0, 2, 1)
-        added = np.zeros((n, d, d))
-        for i, g in enumerate(batch.shared(i, stack) for i in range(n)):
-            added[i, : len(g), : len(g)] = g @ g.T  # a residual may have fewer rows than others of its kind
-        cov = cov + added
+        cov = cov + np.array([g @ g.T for g in batch.shared(stack)])
         useless = stack.behind | ~(np.trace(cov, axis1=1, axis2=2) < _TELLS_NOTHING)
         noise = np.where(stack.behind, 1.0, _TELLS_NOTHING)
         cov = np.where(useless[:, None, None], noise[:, None, None] * np.eye(d), cov)

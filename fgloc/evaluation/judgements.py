@@ -171,7 +171,13 @@ _FEW = 2  # sightings rejected: as few of a landmark in a row are outliers, and 
 _NAMED = 6  # landmarks in one judgement
 
 
-class Judgement(BaseModel):
+class Figures(BaseModel):
+    """A part of ``metrics.json``; immutable."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class Judgement(Figures):
     """One thing that was judged to be wrong.
 
     Attributes:
@@ -187,8 +193,6 @@ class Judgement(BaseModel):
         threshold: that the statistic was held against.
         effect: what it cost or saved.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     number: int = 0
     kind: Kind

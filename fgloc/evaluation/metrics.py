@@ -17,7 +17,6 @@ from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
 from fgloc import se2
 from fgloc.calibration.installation import constants_found
@@ -25,9 +24,8 @@ from fgloc.config import Config, base_role, camera_role
 from fgloc.diagnosis.pairs import MAD
 from fgloc.diagnosis.truth import truth_sentence
 from fgloc.errors import CovarianceError, TrajectoryError
-from fgloc.evaluation.judgements import Judgement, episodes, judgements
+from fgloc.evaluation.judgements import Figures, Judgement, episodes, judgements
 from fgloc.results import RunData
-from fgloc.stats import chi2_bound
 from fgloc.types import Finding, FloatArray, IntArray, Severity, Trajectory, ordered
 
 # --- Pairs of estimated and true poses at the same times --------------------------------------------------------------
@@ -181,16 +179,6 @@ def coverage(errors: FloatArray, covs: FloatArray, k: float) -> float:
     """
     sigmas = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
     return float(np.mean(np.abs(errors) <= k * sigmas))
-
-
-def mean_bounds(dof: int, samples: int, probability: float = 0.95) -> tuple[float, float]:
-    """Interval that holds the mean of `samples` independent χ² variables of `dof` with the given probability.
-
-    For the mean NEES or NIS over independent runs or seeds; successive poses of one run are not independent.
-    """
-    tail = 0.5 * (1.0 - probability)
-    low, high = (chi2_bound(p, dof * samples) / samples for p in (tail, 1.0 - tail))
-    return low, high
 
 
 # --- Warnings that follow from the figures ----------------------------------------------------------------------------
@@ -411,10 +399,8 @@ _Figure = TypeVar("_Figure")
 _LEG_M = 0.02  # shorter moves of the truth are its noise, not distance travelled
 
 
-class StepTimes(BaseModel):
+class StepTimes(Figures):
     """Wall time of one update [ms]."""
-
-    model_config = ConfigDict(frozen=True)
 
     median: float
     p95: float
@@ -422,10 +408,8 @@ class StepTimes(BaseModel):
     max: float
 
 
-class FoundSetting(BaseModel):
+class FoundSetting(Figures):
     """A value of the installation as given and as found, in the units of the configuration."""
-
-    model_config = ConfigDict(frozen=True)
 
     given: float
     prior_sigma: float
@@ -433,10 +417,8 @@ class FoundSetting(BaseModel):
     sigma: float
 
 
-class FoundFinding(BaseModel):
+class FoundFinding(Figures):
     """A finding, as `fgloc.types.Finding` has it; ``severity`` is "error", "warning" or "note"."""
-
-    model_config = ConfigDict(frozen=True)
 
     code: str
     severity: str
@@ -453,10 +435,8 @@ class FoundFinding(BaseModel):
         return cls(code=finding.code, severity=severity, text=finding.text, lines=lines, value=value, sigma=sigma)
 
 
-class GroundMetrics(BaseModel):
+class GroundMetrics(Figures):
     """Errors of the pose in space, on uneven ground: root mean squares, and the mean NEES over 6."""
-
-    model_config = ConfigDict(frozen=True)
 
     ate_rmse_m: float  # distance in space
     height_rmse_m: float
@@ -465,10 +445,8 @@ class GroundMetrics(BaseModel):
     nees_over_6: float  # of x, y, z, roll, pitch and yaw
 
 
-class ProtectionMetrics(BaseModel):
+class ProtectionMetrics(Figures):
     """Bounds on the errors of the poses (docs/integrity.md), and how they held against the truth."""
-
-    model_config = ConfigDict(frozen=True)
 
     median_m: float | None  # of the bounds on the position; None: no pose has one
     p95_m: float | None
@@ -479,19 +457,15 @@ class ProtectionMetrics(BaseModel):
     dangerous: float | None  # likewise, without an alert
 
 
-class OdometryMetrics(BaseModel):
+class OdometryMetrics(Figures):
     """Odometry alone against the truth, moved onto it by the rigid motion that fits best: it has no frame."""
-
-    model_config = ConfigDict(frozen=True)
 
     ate_rmse_m: float
     ate_over_odometry: float | None  # of the run's `ate_rmse_m`; None: odometry alone is without error
 
 
-class Metrics(BaseModel):
+class Metrics(Figures):
     """Content of ``metrics.json``. Keys that need a truth are None without one."""
-
-    model_config = ConfigDict(frozen=True)
 
     duration_s: float
     keyframes: int
@@ -563,20 +537,24 @@ def drift_percent(matched: Matched) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class RelativeError:
-    """Relative pose error over pairs that are `delta` apart: root mean squares and the number of pairs."""
+    """Relative pose error over pairs that are so far apart: root mean squares."""
 
     translation_m: float
     rotation_deg: float
-    pairs: int
 
 
-def relative_error(matched: Matched, delta: float, unit: Literal["frames", "m"]) -> RelativeError | None:
-    """Error of the motion between poses that are `delta` frames, or metres of the estimate's path, apart.
+def relative_error(matched: Matched, apart_m: float) -> RelativeError | None:
+    """Error of the motion between poses that are so many metres of the estimate's path apart.
 
     Equals evo's RPE with consecutive pairs; None if no two poses are that far apart. Source: Sturm et al., "A benchmark
     for the evaluation of RGB-D SLAM systems", 2012, section V.
     """
-    ends = _frame_ends(len(matched.estimate), delta) if unit == "frames" else _path_ends(matched.estimate, delta)
+    ends, travelled = [0], 0.0
+    for i, step in enumerate(np.hypot(*np.diff(matched.estimate[:, :2], axis=0).T), start=1):
+        travelled += float(step)
+        if travelled >= apart_m:
+            ends.append(i)
+            travelled = 0.0
     if len(ends) < 2:
         return None
     errors = []
@@ -584,7 +562,7 @@ def relative_error(matched: Matched, delta: float, unit: Literal["frames", "m"])
         moved = se2.between(matched.estimate[i], matched.estimate[j])
         errors.append(se2.between(se2.between(matched.truth[i], matched.truth[j]), moved))
     translation, rotation = np.hypot(*np.array(errors)[:, :2].T), np.array(errors)[:, 2]
-    return RelativeError(_rms(translation), math.degrees(_rms(rotation)), len(errors))
+    return RelativeError(_rms(translation), math.degrees(_rms(rotation)))
 
 
 def compute_metrics(result: RunData, config: Config) -> Metrics:
@@ -704,20 +682,6 @@ def match_result(result: RunData, config: Config) -> Matched | None:
     if truth is None or len(truth) == 0 or len(matchable(result.trajectory, truth, config.truth.max_gap_s)) < FEWEST:
         return None
     return match(result.trajectory, truth, config.truth.align, config.truth.max_gap_s)
-
-
-def _frame_ends(count: int, delta: float) -> list[int]:
-    return list(range(0, count, max(1, round(delta))))
-
-
-def _path_ends(poses: FloatArray, delta: float) -> list[int]:
-    ends, travelled = [0], 0.0
-    for i, step in enumerate(np.hypot(*np.diff(poses[:, :2], axis=0).T), start=1):
-        travelled += float(step)
-        if travelled >= delta:
-            ends.append(i)
-            travelled = 0.0
-    return ends
 
 
 def _rms(values: FloatArray) -> float:

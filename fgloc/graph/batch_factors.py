@@ -178,11 +178,11 @@ class _Images:
         """Factors of these images, linear about poses and installation; terms of the latter alone go to ``rest``."""
         own = poses[self._row]
         (_, batch), *others = self._observed.batches
-        stack = None if others else batch.evaluate(own, theta)
-        shared = None if stack is None else batch.shared_all(stack)
-        if stack is None or shared is None:
+        if others or not batch.alike:
             yield from self._one_by_one(own, theta)
             return
+        stack = batch.evaluate(own, theta)
+        shared = batch.shared(stack)
         if not np.isfinite(shared).all():
             raise CovarianceError("the covariance of a sighting is not finite")
         ahead = [image[~stack.behind[image]] for image in self._images]

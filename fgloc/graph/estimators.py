@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Iterator, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -470,41 +469,55 @@ class ExtendedKalmanFilter(Estimator):
 _NEVER = 1e9
 
 
-class Backend(Protocol):
-    """Interface of the smoothers that `IncrementalEstimator` uses."""
+class Backend(ABC):
+    """A smoother of GTSAM: both are read through iSAM2."""
 
+    @property
+    @abstractmethod
+    def isam2(self) -> gtsam.ISAM2:
+        """The solver that holds the estimate."""
+
+    @abstractmethod
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
         """Add a keyframe; return the slots of its factors, in their order."""
 
+    @abstractmethod
     def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        """Replace the factors in these slots; return the slots of the new ones."""
-
-    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Add factors on variables that the smoother already has."""
+        """Replace the factors in these slots, if any, by others on variables that are there; the slots of the new."""
 
     def holds(self, k: int) -> bool:
         """Whether a keyframe is in the window."""
+        return bool(self.isam2.valueExists(pose_key(k)))
 
     def pose(self, k: int) -> FloatArray:
         """Estimated pose ``(3,)`` of a keyframe."""
-        ...
+        return pose_vector(self.isam2.calculateEstimatePose2(pose_key(k)))
 
     def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
         """Pose of a keyframe with an installation of ``n`` parameters, and their joint covariance.
 
         ``ground``: the installation ends with height, roll and pitch of the keyframe.
         """
+        pose = self.pose(k)
+        if ground:
+            return _joint_on_ground(self.isam2, pose, k, n)
+        if not n:
+            return PoseWithCovariance(pose, np.asarray(self.isam2.marginalCovariance(pose_key(k))))
+        return _joint(self.isam2, pose, k)
 
 
-class FixedLag:
+class FixedLag(Backend):
     """``IncrementalFixedLagSmoother`` over poses, and the installation, which never leaves the window."""
 
     def __init__(self, config: EstimatorConfig, installed: int, careful: bool = False) -> None:
         self._smoother = gtsam.IncrementalFixedLagSmoother(config.lag_s, isam2_params(config, installed, careful))
         self._installed = False
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
-        """Add a keyframe."""
+    @property
+    def isam2(self) -> gtsam.ISAM2:  # noqa: D102
+        return self._smoother.getISAM2()
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:  # noqa: D102
         stamps = dict.fromkeys(values.keys(), elapsed_s)
         self._installed |= INSTALLATION in stamps
         if self._installed:
@@ -512,71 +525,31 @@ class FixedLag:
         self._smoother.update(graph, values, stamps)  # type: ignore[arg-type]
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
-    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        """Replace the factors in these slots; return the slots of the new ones."""
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:  # noqa: D102
         self._smoother.update(graph, gtsam.Values(), {}, slots)
         return list(self._smoother.getISAM2Result().getNewFactorsIndices())
 
-    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Add factors on variables that the smoother already has."""
-        self._smoother.update(graph, gtsam.Values(), {})
 
-    def holds(self, k: int) -> bool:
-        """Whether a keyframe is in the window."""
-        return bool(self._smoother.getISAM2().valueExists(pose_key(k)))
-
-    def pose(self, k: int) -> FloatArray:
-        """Estimated pose of a keyframe."""
-        return pose_vector(self._smoother.calculateEstimatePose2(pose_key(k)))
-
-    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
-        """Pose and installation with their joint covariance."""
-        pose = self.pose(k)
-        if ground:
-            return _joint_on_ground(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector, k, n)
-        if not n:
-            return PoseWithCovariance(pose, np.asarray(self._smoother.marginalCovariance(pose_key(k))))
-        return _joint(self._smoother.getISAM2(), pose, self._smoother.calculateEstimateVector(INSTALLATION), k)
-
-
-class WholeRun:
+class WholeRun(Backend):
     """``ISAM2`` over the whole run: landmarks may be variables; the cost grows with the run."""
 
     def __init__(self, config: EstimatorConfig, careful: bool = False) -> None:
         self._isam2 = gtsam.ISAM2(isam2_params(config, careful=careful))
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:
-        """Add a keyframe."""
+    @property
+    def isam2(self) -> gtsam.ISAM2:  # noqa: D102
+        return self._isam2
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, elapsed_s: float) -> list[int]:  # noqa: D102
         return list(self._isam2.update(graph, values).getNewFactorsIndices())
 
-    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:
-        """Replace the factors in these slots; return the slots of the new ones."""
+    def swap(self, graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> list[int]:  # noqa: D102
         return list(self._isam2.update(graph, gtsam.Values(), slots).getNewFactorsIndices())
 
-    def hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        """Add factors on variables that the smoother already has."""
-        self._isam2.update(graph, gtsam.Values())
 
-    def holds(self, k: int) -> bool:
-        """Whether a keyframe is in the window."""
-        return bool(self._isam2.valueExists(pose_key(k)))
-
-    def pose(self, k: int) -> FloatArray:
-        """Estimated pose of a keyframe."""
-        return pose_vector(self._isam2.calculateEstimatePose2(pose_key(k)))
-
-    def belief(self, k: int, n: int, ground: bool = False) -> PoseWithCovariance:
-        """Pose and installation with their joint covariance."""
-        pose = self.pose(k)
-        if ground:
-            return _joint_on_ground(self._isam2, pose, self._isam2.calculateEstimateVector, k, n)
-        if not n:
-            return PoseWithCovariance(pose, np.asarray(self._isam2.marginalCovariance(pose_key(k))))
-        return _joint(self._isam2, pose, self._isam2.calculateEstimateVector(INSTALLATION), k)
-
-
-def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> PoseWithCovariance:
+def _joint(isam2: gtsam.ISAM2, pose: FloatArray, k: int) -> PoseWithCovariance:
     """Pose and installation with their joint covariance, of its square-root information: (RᵀR)⁻¹."""
+    theta = isam2.calculateEstimateVector(INSTALLATION)
     R, _ = isam2.jointBayesNet(pose_key(k), INSTALLATION).matrix()
     upper, failed = dpotri(R)
     if failed:
@@ -586,14 +559,14 @@ def _joint(isam2: gtsam.ISAM2, pose: FloatArray, theta: FloatArray, k: int) -> P
     return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], InstallationEstimate(np.asarray(theta), P[3:, 3:]))
 
 
-def _joint_on_ground(
-    isam2: gtsam.ISAM2, pose: FloatArray, estimate: Callable[[int], FloatArray], k: int, n: int
-) -> PoseWithCovariance:
+def _joint_on_ground(isam2: gtsam.ISAM2, pose: FloatArray, k: int, n: int) -> PoseWithCovariance:
     """Joint belief as `_joint`; the installation ends with height, roll and pitch of the ground at the keyframe."""
     keys = [pose_key(k), *([INSTALLATION] if n > len(GROUND) else []), ground_key(k)]
     found = isam2.jointMarginalCovariance(keys)
     P = np.block([[np.asarray(found.at(a, b)) for b in keys] for a in keys])
-    known = InstallationEstimate(np.concatenate([np.asarray(estimate(key)) for key in keys[1:]]), P[3:, 3:])
+    known = InstallationEstimate(
+        np.concatenate([np.asarray(isam2.calculateEstimateVector(key)) for key in keys[1:]]), P[3:, 3:]
+    )
     return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], known)
 
 
@@ -689,7 +662,7 @@ class IncrementalEstimator(Estimator):
         belief = self._found(k)
         while self._hold_beyond_gate(belief):
             assert self._backend is not None
-            self._backend.hold(self._holding())
+            self._backend.swap(self._holding(), [])
             belief = self._found(k)
         return self._considered(belief)
 
@@ -720,7 +693,7 @@ class IncrementalEstimator(Estimator):
             H = np.zeros((len(more), self.installation.constants))
             H[:, own] = np.linalg.cholesky(more).T
             graph.add(linear_factor({INSTALLATION: H}, np.zeros(len(more)), values))
-        self._backend.hold(graph)
+        self._backend.swap(graph, [])
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""

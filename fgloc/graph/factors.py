@@ -226,26 +226,24 @@ class LandmarkFactors:
 
     def with_installation(self, installation: Installation) -> LandmarkFactors:
         """Copy with another installation; parameters with a smaller prior sigma than before start from its mean."""
-        other = copy.copy(self)
-        other.installation = installation
         held = np.flatnonzero(installation.sigmas < self.installation.sigmas)
         mean = self._estimated.mean.copy()
         mean[held] = installation.prior().mean[held]
-        other.estimated = InstallationEstimate(mean, self._estimated.cov)
-        other._prepared = (), None
+        return self._copied(installation, InstallationEstimate(mean, self._estimated.cov))
+
+    def _copied(self, installation: Installation, estimated: InstallationEstimate) -> LandmarkFactors:
+        other = copy.copy(self)
+        other.installation, other.estimated, other._prepared = installation, estimated, ((), None)
         return other
 
     def with_states(self, ids: Iterable[int]) -> LandmarkFactors:
         """Copy in which these landmarks are states, from the map on; the other constants start as they are known."""
         installation = self.installation.with_states(ids)
-        other = copy.copy(self)
-        other.installation, other._prepared = installation, ((), None)
         known = installation.prior()
         for i, name in enumerate(self.installation.names):
             if not name.startswith("map."):
                 known.mean[installation.index[name]] = self._estimated.mean[i]
-        other.estimated = known
-        return other
+        return self._copied(installation, known)
 
     def with_mounting(self, kind: str, name: str, before: FloatArray) -> LandmarkFactors:
         """Copy for a camera that was knocked; see `Installation.with_mounting`.
@@ -258,16 +256,14 @@ class LandmarkFactors:
         installation = self.installation.with_mounting(kind, name)
         if installation is self.installation:
             return self
-        other, (rows, _) = copy.copy(self), self.installation.mounting(kind)
-        other.installation, other._prepared = installation, ((), None)
+        rows, _ = self.installation.mounting(kind)
         known = installation.prior()
         for i, own in enumerate(self.installation.names):
             known.mean[installation.index[own]] = self._estimated.mean[i]
         first, count = installation.blocks[camera_block(name)]
         known.mean[first : first + count] = self._estimated.mean[rows[0] : rows[0] + count]
         known.mean[[installation.index[self.installation.names[i]] for i in rows]] = before
-        other.estimated = known
-        return other
+        return self._copied(installation, known)
 
     @property
     def estimated(self) -> InstallationEstimate:

@@ -95,21 +95,19 @@ class Batch(Protocol):
     Attributes:
         rows: length of the residual of each.
         spatial: whether poses on uneven ground are ``(m, 6)``, with height, roll and pitch; else ``(m, 3)``.
+        alike: whether the measurements of a recording are of one size, so that images of them can be stacked.
     """
 
     rows: list[int]
     spatial: ClassVar[bool]
+    alike: ClassVar[bool]
 
     def evaluate(self, poses: FloatArray, theta: FloatArray, by_installation: bool = True) -> Stacked:
         """Residuals and Jacobians of all, each at its own pose ``(m, 3)``; without those by the installation faster."""
         ...
 
-    def shared_all(self, stack: Stacked) -> FloatArray | None:
-        """`Linearized.shared` of all ``(m, d, s)``, with columns of 0 where one has fewer; None: only one by one."""
-        ...
-
-    def shared(self, i: int, stack: Stacked) -> FloatArray:
-        """Return `Linearized.shared` of sighting ``i``."""
+    def shared(self, stack: Stacked) -> FloatArray:
+        """`Linearized.shared` of all ``(m, d, s)``, with rows and columns of 0 where one has fewer."""
         ...
 
 
@@ -201,6 +199,7 @@ class CornerBatch:
     """
 
     spatial: ClassVar[bool] = True
+    alike: ClassVar[bool] = True
 
     def __init__(
         self, seen: Sequence[PixelMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
@@ -390,8 +389,8 @@ class CornerBatch:
         along = np.hypot(self._twist[:, 0], self._twist[:, 1]) * off / depth
         return np.asarray(f * (np.abs(self._twist[:, 2]) * (1.0 + off**2) + along))
 
-    def shared_all(self, stack: Stacked) -> FloatArray:
-        """`shared` of all sightings ``(m, 8, s)``; columns that one lacks are 0."""
+    def shared(self, stack: Stacked) -> FloatArray:
+        """Square roots ``(m, 8, s)`` of the covariances that sightings share with their image, see `Linearized`."""
         shrunk = self._outward * (self._small * self._blur_px / self._noise_px)[:, None]
         if stack.whitening is not None:
             shrunk = (stack.whitening @ shrunk[..., None])[..., 0]
@@ -403,19 +402,6 @@ class CornerBatch:
             return common
         roots = np.array([np.zeros((3, 3)) if moved is None else moved for moved in self._moved])
         return np.concatenate([common, stack.J[:, :, :3] @ roots], axis=2)
-
-    def shared(self, i: int, stack: Stacked) -> FloatArray:
-        """Square root ``(8, s)`` of the covariance that sighting ``i`` shares with its image, see `Linearized`."""
-        shrunk = self._outward[i, :, None] * (self._small[i] * self._blur_px[i] / self._noise_px[i])
-        if stack.whitening is not None:
-            shrunk = stack.whitening[i] @ shrunk
-        common = [shrunk, self._jitter[i] * stack.H[i, :, 11:12]]
-        if stack.by_tilt is not None:
-            common.append(self._sway[i] * stack.by_tilt[i])
-        moved = self._moved[i]
-        if moved is not None:
-            common.append(stack.J[i, :, :3] @ moved)
-        return np.hstack(common)
 
 
 def _widest(camera: Camera) -> float:
@@ -502,6 +488,7 @@ class PlanarBatch:
     """Ranges with bearings, as points in the base frame, and marker poses."""
 
     spatial: ClassVar[bool] = False
+    alike: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -573,13 +560,9 @@ class PlanarBatch:
         made = Stacked(np.einsum("nij,nj->ni", W, residual), W @ J, W @ H, self._columns, np.zeros(n, dtype=np.bool_))
         return made if self._roots is None else made.with_noise(W[:, :, :2] @ turn @ R @ self._roots)
 
-    def shared_all(self, stack: Stacked) -> FloatArray:
-        """`shared` of all sightings ``(m, 3, 0)``."""
+    def shared(self, stack: Stacked) -> FloatArray:
+        """Matrices ``(m, 3, 0)``: the noise of these sightings has no shared part, see `Linearized`."""
         return np.zeros((*stack.residual.shape, 0))
-
-    def shared(self, i: int, stack: Stacked) -> FloatArray:
-        """Matrix ``(d, 0)``: the noise of these sightings has no shared part, see `Linearized`."""
-        return np.zeros((self.rows[i], 0))
 
 
 # --- Measurements of registered sensors -------------------------------------------------------------------------------
@@ -589,6 +572,7 @@ class PoseBatch:
     """Measurements of any dimensions; see `PoseMeasurement`."""
 
     spatial: ClassVar[bool] = False
+    alike: ClassVar[bool] = False
 
     def __init__(
         self, seen: Sequence[PoseMeasurement], landmarks: Mapping[int, Landmark], installation: Installation
@@ -613,16 +597,16 @@ class PoseBatch:
         H *= (self._columns >= 0)[:, None]
         return Stacked(residual, J, H, self._columns, np.zeros(n, dtype=np.bool_))
 
-    def shared_all(self, stack: Stacked) -> None:
-        """Return None, as these measurements have different dimensions."""
-
-    def shared(self, i: int, stack: Stacked) -> FloatArray:
-        """Square root ``(d, s)`` of the covariance by the motion from measurement to keyframe, see `Linearized`."""
-        m, J = self._seen[i], stack.J[i, : self.rows[i]]
-        if m.motion_cov is None:
-            return np.zeros((len(J), 0))
-        values, vectors = np.linalg.eigh(m.motion_cov)
-        return np.asarray(J @ se2.adjoint(m.T_keyframe_then) @ (vectors * np.sqrt(np.maximum(values, 0.0))))
+    def shared(self, stack: Stacked) -> FloatArray:
+        """Square roots ``(m, d, s)`` of the covariances by the motions to the keyframe, see `Linearized`."""
+        moved = [(i, m, m.motion_cov) for i, m in enumerate(self._seen) if m.motion_cov is not None]
+        shared = np.zeros((*stack.residual.shape, se2.DOF if moved else 0))
+        for i, m, cov in moved:
+            J = stack.J[i, : self.rows[i]]
+            values, vectors = np.linalg.eigh(cov)
+            root = vectors * np.sqrt(np.maximum(values, 0.0))
+            shared[i, : self.rows[i]] = J @ se2.adjoint(m.T_keyframe_then) @ root
+        return shared
 
 
 # --- Sightings of any kind --------------------------------------------------------------------------------------------
@@ -678,14 +662,15 @@ class Observations:
             batch = self.batches[0][1]
             stack = batch.evaluate(np.broadcast_to(pose, (self._count, 3)), theta)
             m, d = stack.residual.shape
-            shared = batch.shared_all(stack)
-            if shared is not None and min(batch.rows) == d:
+            if batch.alike and min(batch.rows) == d:
                 H = np.zeros((m, d, 4 + len(theta)))  # the last column takes what is no state
                 H[:, :, :3] = stack.J
                 columns = np.where(stack.columns < 0, len(theta), stack.columns) + 3
                 H[np.arange(m)[:, None, None], np.arange(d)[:, None], columns[:, None]] = stack.H
                 rows = H.reshape(m * d, -1)[:, :-1]
-                return Lines(stack.residual.ravel(), rows, shared.reshape(m * d, -1), batch.rows, stack.behind)
+                return Lines(
+                    stack.residual.ravel(), rows, batch.shared(stack).reshape(m * d, -1), batch.rows, stack.behind
+                )
         return Lines.of(self.linearize(pose, theta), len(theta))
 
     def linearize(self, poses: FloatArray, theta: FloatArray) -> list[Linearized]:
@@ -694,12 +679,17 @@ class Observations:
         found: dict[int, Linearized] = {}
         for rows, batch in self.batches:
             stack = batch.evaluate(each[rows], theta)
+            all_shared = batch.shared(stack)
             for i, row in enumerate(rows):
                 used = stack.columns[i] >= 0
                 d = batch.rows[i]
                 H, J = stack.H[i, :d], stack.J[i, :d]
-                shared = batch.shared(i, stack)
                 found[row] = Linearized(
-                    stack.residual[i, :d], J, stack.columns[i][used], H[:, used], shared, bool(stack.behind[i])
+                    stack.residual[i, :d],
+                    J,
+                    stack.columns[i][used],
+                    H[:, used],
+                    all_shared[i, :d],
+                    bool(stack.behind[i]),
                 )
         return [found[i] for i in range(self._count)]

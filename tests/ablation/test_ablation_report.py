@@ -19,7 +19,7 @@ from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
 from fgloc.ablation.report import (
     ATE,
     Curves,
-    Point,
+    Entry,
     Tracks,
     _curves,
     _measurable,
@@ -185,7 +185,7 @@ def test_few_runs_are_drawn_one_by_one_and_axes_speak(bag):
     axes = plot_severity([curves], ATE.label).axes[0]
     assert not axes.collections  # of three runs no band
     assert sum(len(line.get_xdata()) for line in axes.lines if line.get_marker() == ".") == 3 + 2 + 3 + 3
-    many = Point(1.0, 3.0, (2.0, 4.0), (2.0, 2.5, 3.0, 3.5, 4.0))
+    many = Entry("x", 1.0, "full", ATE, (2.0, 2.5, 3.0, 3.5, 4.0), 5)
     axes = plot_severity([Curves("x", "y", {"full": [many, many]})], ATE.label).axes[0]
     assert len(axes.collections) == 1
     figure = plot_tracks([Tracks("x", [(0, 0), (1, 1)], [(0, 0), (1, 0)])])
