@@ -22,7 +22,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 import fgloc
-from fgloc import se2
 from fgloc.ablation.failures import corrupt, generators
 from fgloc.ablation.suite import Cell
 from fgloc.config import Config, files_of
@@ -30,8 +29,8 @@ from fgloc.errors import FglocError, OutputError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
 from fgloc.files.outputs import sha256_of, write_json, write_text
-from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import open_recording
+from fgloc.recording.truth import base_pose, lacks_yaw
 from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.failures import Scene
@@ -376,11 +375,12 @@ def start_at_truth(bag: Path, config: Config) -> Config:
         RecordingError: the recording has no truth.
     """
     with open_recording(bag, config.recording) as recording:
-        first = next((event for event in recording.events() if isinstance(event, TruthEvent)), None)
+        truth = [event for event in recording.events() if isinstance(event, TruthEvent)]
+    if lacks_yaw(np.array([base_pose(event, config.truth) for event in truth]).reshape(-1, 3)):
+        raise RecordingError(f"{bag}: the truth has no yaw to start with; give estimator.initial_pose")
+    first = next(iter(truth), None)
     if first is None:
         raise RecordingError(f"{bag}: no truth to start from; use 'start: configured' and estimator.initial_pose")
-    T_body_base = se2.inverse((*config.truth.offset_m, config.truth.yaw_offset_rad))
-    pose = se2.compose((first.position[0], first.position[1], quaternion_yaw(first.orientation)), T_body_base)
-    x, y, yaw = pose.tolist()
+    x, y, yaw = base_pose(first, config.truth).tolist()
     estimator = config.estimator.model_copy(update={"initial_pose": (x, y, yaw)})
     return config.model_copy(update={"estimator": estimator})

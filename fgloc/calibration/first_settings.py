@@ -33,7 +33,7 @@ from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.fields import NumericField, unread_numbers
 from fgloc.recording.info import LACKING, RecordingInfo, inspect_recording, placing_roles
-from fgloc.recording.reader import TF_TYPES, Recording, converters_of, is_derived
+from fgloc.recording.reader import POINT, TF_TYPES, Recording, converters_of, is_derived
 from fgloc.recording.storage import Storage, find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
@@ -304,7 +304,7 @@ _MOST_NUMBERS = 12  # lines
 
 
 def _numbers(bag: Path) -> Iterator[NumericField]:
-    known = TF_TYPES.union(*map(converters_of, role_names()))
+    known = TF_TYPES.union(*map(converters_of, role_names())) - {POINT}
     with closing(Storage(bag)) as storage:
         yield from unread_numbers(storage, known)
 

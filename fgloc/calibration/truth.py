@@ -25,7 +25,7 @@ from fgloc.config import Config, NoiseDensity
 from fgloc.errors import EstimatorError
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import open_recording
-from fgloc.recording.truth import base_pose
+from fgloc.recording.truth import base_pose, lacks_yaw
 from fgloc.sensors import registry
 from fgloc.sensors.base import InstallationState, Rank, with_values
 from fgloc.sensors.wheels.motion import INSTALLATION, WheelMotion
@@ -126,6 +126,8 @@ def _recorded(bag: Path, config: Config) -> _Recorded:
     table = table[np.append(True, np.abs(np.diff(table[:, 1:], axis=0)).max(axis=1, initial=0.0) > 0.0)[: len(table)]]
     motion.sort(key=lambda event: event.stamp_ns)
     stamps = np.array([event.stamp_ns for event in motion], dtype=np.int64)
+    if lacks_yaw(table[:, 1:]):
+        raise EstimatorError(f"{bag}: the truth has positions and no yaw; wheels are calibrated by a truth with yaw")
     windows = list(_windows(table[:, 0], origin_ns, stamps))
     if len(windows) < _FEWEST:
         raise EstimatorError(

@@ -185,8 +185,10 @@ def _finish(result: RunResult, metrics: Metrics, out: Path, rrd: Path | None, mc
 
     write_for_viewers(result, rrd, mcap)
     rows = [("duration", f"{metrics.duration_s:.1f} s"), ("keyframes", str(metrics.keyframes))]
-    if metrics.ate_mean_m is not None and metrics.yaw_mae_deg is not None:
-        rows += [("ATE mean", f"{metrics.ate_mean_m:.4f} m"), ("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg")]
+    if metrics.ate_mean_m is not None:
+        rows.append(("ATE mean", f"{metrics.ate_mean_m:.4f} m"))
+    if metrics.yaw_mae_deg is not None:
+        rows.append(("yaw MAE", f"{metrics.yaw_mae_deg:.3f} deg"))
     if metrics.nees_over_3 is not None:
         rows.append(("NEES/3", f"{metrics.nees_over_3:.2f}"))
     rows += [("rejected", str(sum(metrics.rejections.values()))), ("report", str(out / "report.html"))]
@@ -402,16 +404,16 @@ def evaluate(
 
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
     matched = match(read_tum(estimate), read_tum(truth), kind, max_gap)
-    drift, relative = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0)
+    drift, relative, yaw = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0), matched.has_yaw
     rows = [
         ("poses matched", f"{len(matched.stamps_ns)}"),
         ("ATE mean", f"{metrics.ate_mean_m(matched):.6f} m"),
         ("ATE rmse", f"{metrics.ate_rmse_m(matched):.6f} m"),
-        ("yaw MAE", f"{metrics.yaw_mae_deg(matched):.6f} deg"),
+        ("yaw MAE", f"{metrics.yaw_mae_deg(matched):.6f} deg" if yaw else "-"),
         ("end error", f"{metrics.end_error_m(matched):.6f} m"),
         ("drift", "-" if drift is None else f"{drift:.4f} %"),
         ("RPE per metre, position", "-" if relative is None else f"{relative.translation_m:.6f} m"),
-        ("RPE per metre, yaw", "-" if relative is None else f"{relative.rotation_deg:.6f} deg"),
+        ("RPE per metre, yaw", "-" if relative is None or not yaw else f"{relative.rotation_deg:.6f} deg"),
     ]
     size = metrics.size_of(matched)
     if size is not None:

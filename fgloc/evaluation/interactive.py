@@ -73,7 +73,7 @@ def _truth(matched: Matched) -> Mapping[str, Any]:
 
 def _errors(result: RunData, matched: Matched, axis: TimeAxis) -> Mapping[str, Any]:
     times = axis.place(seconds(result, matched.stamps_ns))
-    yaws = _DEGREES * np.abs(matched.errors[:, 2])
+    yaws = _DEGREES * np.abs(matched.errors[:, 2]) if matched.has_yaw else np.full(len(times), math.nan)
     t, position, yaw = _thinned_columns(matched, np.column_stack([times, 1e3 * matched.distances, yaws]))
     return {"t": _rounded(t, 3), "position_mm": _rounded(position, 2), "yaw_deg": _rounded(yaw, 4)}
 

@@ -44,6 +44,7 @@ class Matched:
     truth: FloatArray  # (n, 3)
     covs: FloatArray | None  # (n, 3, 3) of the estimate
     T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
+    has_yaw: bool = True  # False: the truth has positions only, and its yaw here is the estimate's
     ground: FloatArray | None = None  # (n, 3) estimated height, roll and pitch; None: the floor is flat
     true_ground: FloatArray | None = None  # (n, 3); None: not known
     ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw
@@ -72,12 +73,24 @@ class Matched:
 
 
 def match(
-    estimate: Trajectory, truth: Trajectory, align: Literal["none", "se2"] = "none", max_gap_s: float = 0.2
+    estimate: Trajectory,
+    truth: Trajectory,
+    align: Literal["none", "se2"] = "none",
+    max_gap_s: float = 0.2,
+    T_body_base: FloatArray | None = None,
 ) -> Matched:
     """Bring the truth to the estimate's stamps and, if asked, into its frame.
 
     Equal stamps match exactly; between two stamps of the truth no further apart than `max_gap_s` the truth is
-    interpolated; elsewhere the estimate has no partner and is left out.
+    interpolated; elsewhere the estimate has no partner and is left out. A truth of positions, whose yaw never changes
+    while the robot turns, is compared by positions alone.
+
+    Args:
+        estimate: poses of the base.
+        truth: poses of the base, too.
+        align: how the truth is moved into the estimate's frame.
+        max_gap_s: see above.
+        T_body_base: ``(3,)`` base in the body that the truth tracks; None: it tracks the base.
 
     Raises:
         TrajectoryError: fewer than two poses have a partner.
@@ -92,41 +105,60 @@ def match(
     stamps = estimate.stamps_ns[indices]
     poses = estimate.poses[indices]
     reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
-    T_map_truth = np.zeros(3)
+    has_yaw, lever, T_map_truth = not _lacks_yaw(reference, poses), np.zeros((len(poses), 2)), np.zeros(3)
+    if not has_yaw and T_body_base is not None:
+        reference[:, :2] -= se2.compose((0.0, 0.0, reference[0, 2] - T_body_base[2]), T_body_base)[:2]  # of the body
+        lever = se2.compose_array(poses * (0.0, 0.0, 1.0), np.tile(se2.inverse(T_body_base), (len(poses), 1)))[:, :2]
     if align == "se2":
-        T_map_truth = se2.rigid(reference[:, :2], poses[:, :2])
+        T_map_truth = se2.rigid(reference[:, :2], poses[:, :2] + lever)
         reference = se2.compose_array(T_map_truth, reference)
+    if not has_yaw:
+        reference = np.column_stack([reference[:, :2] - lever, poses[:, 2]])
     covs = None if estimate.covs is None else estimate.covs[indices]
-    if estimate.ground is None or estimate.ground_covs is None or truth.ground is None or align == "se2":
-        return Matched(stamps, poses, reference, covs, T_map_truth)
+    in_space = align == "none" and has_yaw
+    if not in_space or estimate.ground is None or estimate.ground_covs is None or truth.ground is None:
+        return Matched(stamps, poses, reference, covs, T_map_truth, has_yaw=has_yaw)
     true = np.column_stack([np.interp(stamps, truth.stamps_ns, column) for column in truth.ground.T])
     ground, spatial = estimate.ground[indices], estimate.ground_covs[indices]
-    return Matched(stamps, poses, reference, covs, T_map_truth, ground, true, spatial)
+    return Matched(stamps, poses, reference, covs, T_map_truth, ground=ground, true_ground=true, ground_covs=spatial)
+
+
+def _lacks_yaw(truth: FloatArray, poses: FloatArray) -> bool:
+    """Whether a truth's yaw ``(n, 3)`` never changes, while its positions do and the estimate's yaw does."""
+    turned, own = (float(np.ptp(np.unwrap(p[:, 2]))) for p in (truth, poses))
+    return turned < _NO_YAW_RAD < _TURNED_RAD < own and float(np.ptp(truth[:, :2], axis=0).max()) > 0.0
 
 
 def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
-    """Errors ``(n, 3)`` and their covariances ``(n, 3, 3)`` where the truth's frame is fitted.
+    """Errors ``(n, d)`` and their covariances ``(n, d, d)`` where the truth's frame is fitted; see `compared`.
 
     Without a map the covariance is relative to the first pose, which is the origin, while a frame that is fitted to all
     positions alike spreads the drift over the whole path. So the frame is fitted by the covariances: weighted least
     squares over its rigid motion, the truth's own noise added.
     """
     assert matched.covs is not None
-    covs = matched.covs + _TRUTH
+    errors, covs = compared(matched)
+    d = errors.shape[1]
+    covs = covs + _TRUTH[:d, :d]
     weights, truth = np.linalg.inv(covs), matched.truth
-    errors = matched.errors
     for _ in range(_ROUNDS):
-        J = np.zeros((len(truth), 3, 3))  # of the moved truth by x, y and yaw of the frame
-        J[:] = np.eye(3)
+        J = np.zeros((len(truth), d, 3))  # of the moved truth by x, y and yaw of the frame
+        J[:] = np.eye(3)[:d]
         J[:, 0, 2], J[:, 1, 2] = -truth[:, 1], truth[:, 0]
         H, b = np.einsum("nij,nik,nkl->jl", J, weights, J), np.einsum("nij,nik,nk->j", J, weights, errors)
         step = np.linalg.lstsq(H, b, rcond=None)[0]
         truth = se2.compose_array(step, truth)
-        errors = matched.estimate - truth
-        errors[:, 2] = se2.wrap_array(errors[:, 2])
+        errors, _ = compared(replace(matched, truth=truth))
         if float(np.abs(step).max()) < 1e-9:
             break
     return errors, covs
+
+
+def compared(matched: Matched) -> tuple[FloatArray, FloatArray]:
+    """Errors ``(n, d)`` and their covariances ``(n, d, d)``; d is 3, or 2 where the truth has no yaw."""
+    assert matched.covs is not None
+    d = 3 if matched.has_yaw else 2
+    return matched.errors[:, :d], matched.covs[:, :d, :d]
 
 
 def matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:
@@ -250,13 +282,12 @@ def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | N
 
 def _turned(config: Config, matched: Matched) -> Finding | None:
     """Finding that the truth's yaw is another axis than the robot's: off by one angle, where positions agree."""
+    if not matched.has_yaw:
+        return None
     off = se2.wrap_array(matched.errors[:, 2])
     mean = float(np.angle(np.exp(1j * off).mean()))
     spread = float(np.median(np.abs(se2.wrap_array(off - mean)))) * MAD
     agree = ate_rmse_m(matched) < _AGREE * float(np.hypot(*matched.truth[:, :2].std(axis=0)))
-    true, own = (float(np.ptp(np.unwrap(poses[:, 2]))) for poses in (matched.truth, matched.estimate))
-    if true < _NO_YAW_RAD < _TURNED_RAD < own:
-        return None  # the truth has no yaw
     if not agree or abs(mean) < _TURNED_RAD or spread > _AGREE * abs(mean):
         return None
     offset = round(math.remainder(config.truth.yaw_offset_rad - mean, math.tau), 3)
@@ -475,7 +506,7 @@ class Metrics(Figures):
     yaw_mae_deg: float | None
     end_error_m: float | None
     drift_percent: float | None
-    nees_over_3: float | None
+    nees_over_3: float | None  # by position alone, and over 2, where the truth has no yaw
     coverage: dict[str, float] | None  # by number of sigmas: "1", "2", "3"
     ground: GroundMetrics | None  # None: estimated on a flat floor, or no truth
     odometry: OdometryMetrics | None  # None: no truth, or nothing measured the motion
@@ -509,9 +540,9 @@ def ate_rmse_m(matched: Matched) -> float:
     return float(np.sqrt(np.mean(matched.distances**2)))
 
 
-def yaw_mae_deg(matched: Matched) -> float:
-    """Mean absolute yaw error [°], wrapped. Source: the paper, eq. 12."""
-    return float(np.degrees(np.mean(np.abs(matched.errors[:, 2]))))
+def yaw_mae_deg(matched: Matched) -> float | None:
+    """Mean absolute yaw error [°], wrapped; None: the truth has no yaw. Source: the paper, eq. 12."""
+    return None if not matched.has_yaw else float(np.degrees(np.mean(np.abs(matched.errors[:, 2]))))
 
 
 def end_error_m(matched: Matched) -> float:
@@ -581,8 +612,11 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
     honest: tuple[float | None, dict[str, float] | None] = (None, None)
     if matched is not None and matched.covs is not None:
         fitted = config.truth.align == "se2"
-        errors, covs = in_own_gauge(matched) if fitted else (matched.errors, matched.covs)
-        honest = (float(np.mean(nees(errors, covs))) / 3.0, {str(k): coverage(errors, covs, k) for k in (1, 2, 3)})
+        errors, covs = in_own_gauge(matched) if fitted else compared(matched)
+        honest = (
+            float(np.mean(nees(errors, covs))) / errors.shape[1],
+            {str(k): coverage(errors, covs, k) for k in (1, 2, 3)},
+        )
     return Metrics(
         duration_s=duration,
         keyframes=len(stamps),
@@ -681,7 +715,8 @@ def match_result(result: RunData, config: Config) -> Matched | None:
     truth = result.truth
     if truth is None or len(truth) == 0 or len(matchable(result.trajectory, truth, config.truth.max_gap_s)) < FEWEST:
         return None
-    return match(result.trajectory, truth, config.truth.align, config.truth.max_gap_s)
+    T_body_base = se2.inverse((*config.truth.offset_m, config.truth.yaw_offset_rad))
+    return match(result.trajectory, truth, config.truth.align, config.truth.max_gap_s, T_body_base)
 
 
 def _rms(values: FloatArray) -> float:

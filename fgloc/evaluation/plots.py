@@ -294,7 +294,8 @@ def plot_error(result: RunData, matched: Matched | None) -> Figure:
     rows: list[Axes] = figure.subplots(3, 1, sharex=True).tolist()
     axis_of_time = TimeAxis.of(result, received=False)
     for axis, (axes, name) in enumerate(zip(rows, ("x", "y", "yaw"), strict=True)):
-        known = None if matched is None else (matched.stamps_ns, np.abs(matched.errors[:, axis]))
+        compared = matched if matched is not None and (matched.has_yaw or axis < 2) else None
+        known = None if compared is None else (compared.stamps_ns, np.abs(compared.errors[:, axis]))
         scale = ErrorScale.of(result, None if bands is None else bands[:, axis], known, angle=axis == 2)
         if bands is not None:
             times = seconds(result, trajectory.stamps_ns)
@@ -302,9 +303,9 @@ def plot_error(result: RunData, matched: Matched | None) -> Figure:
             axes.fill_between(t, -band, band, color=SKY, alpha=0.25, lw=0)
             axes.plot(t, band, color=SKY, lw=0.8)
             axes.plot(t, -band, color=SKY, lw=0.8)
-        if matched is not None:
-            times = seconds(result, matched.stamps_ns)
-            t, error = broken(matched.stamps_ns, np.column_stack([times, scale.unit * matched.errors[:, axis]])).T
+        if compared is not None:
+            times = seconds(result, compared.stamps_ns)
+            t, error = broken(compared.stamps_ns, np.column_stack([times, scale.unit * compared.errors[:, axis]])).T
             axes.plot(t, error, color=BLUE, lw=1.0)
         axes.axhline(0.0, color=GREY, lw=0.6)
         tidy(axes)
@@ -401,7 +402,8 @@ def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: Int
         rows = min(len({_row_of(d) for d in sightings}), _MAX_LANDMARKS)
         panels.append((0.9 * rows, lambda axes: _landmarks(axes, result, span, sightings)))
     if matched is not None:
-        panels += [(5.0, lambda axes, k=k: _error(axes, result, matched, yaw=k)) for k in (False, True)]  # type: ignore[misc]
+        kinds = (False, True) if matched.has_yaw else (False,)
+        panels += [(5.0, lambda axes, k=k: _error(axes, result, matched, yaw=k)) for k in kinds]  # type: ignore[misc]
     if not panels:
         panels.append(
             (1.0, lambda axes: _activity(axes, span, "keyframes", {"all": _poses(result)}, BLUE, bridge=True))

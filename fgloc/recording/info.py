@@ -266,7 +266,6 @@ _UNREAD = {
     "MultiEchoLaserScan": "laser scans",
     "PointCloud2": "point clouds",
     "NavSatFix": "satellite fixes",
-    "PointStamped": "points, such as places without a heading",
 }  # what tells where a robot is, by type of message
 _NO_PLACE = frozenset(BUILT_IN_ROLES) - {"image", "sightings"}  # roles that do not tell where in the map a robot is
 

@@ -109,6 +109,10 @@ def _transform_truth(m: Any, when: When) -> Event:
     return TruthEvent(*when, m.header.frame_id, xyz(m.transform.translation), xyzw(m.transform.rotation))
 
 
+def _point_truth(m: Any, when: When) -> Event:
+    return TruthEvent(*when, m.header.frame_id, xyz(m.point), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
 def _planar_truth(m: Any, when: When) -> Event:
     half = 0.5 * float(m.theta)
     orientation = np.array([0.0, 0.0, math.sin(half), math.cos(half)]) if math.isfinite(half) else np.full(4, math.nan)
@@ -116,6 +120,7 @@ def _planar_truth(m: Any, when: When) -> Event:
 
 
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"  # as Vicon's bridge publishes poses
+POINT = "geometry_msgs/msg/PointStamped"  # a total station's, without a yaw; or a click on a map
 CONVERTERS: dict[Role, dict[str, Converter]] = {
     "camera_info": {"sensor_msgs/msg/CameraInfo": _camera_info},
     "truth": {
@@ -124,6 +129,7 @@ CONVERTERS: dict[Role, dict[str, Converter]] = {
         "geometry_msgs/msg/Pose2D": _planar_truth,
         _TRANSFORM: _transform_truth,
         "nav_msgs/msg/Odometry": _covariance_truth,
+        POINT: _point_truth,
     },
 }
 """Of the roles that no sensor has."""
@@ -214,7 +220,8 @@ def select_roles(
                 f"configuration (recording.topics.{role}: {candidates[0]}), or {none}"
             )
         else:
-            notes.append(_unnamed(role, filled))
+            free = [t for t in filled if t.name not in (*roles.values(), *config.of_joints)]
+            notes.append(_unnamed(role, free))
     notes.append(_one_of_images_and_sightings(roles, config))
     told = [topic.name for topic in filled if topic.message_type in converters_of("truth")]
     own = [name for name in told if name.startswith(OWN) and name not in roles.values()]
@@ -319,7 +326,7 @@ def _fits(role: Role, topic: TopicInfo) -> bool:
     if topic.message_type not in converters_of(role):
         return False
     if role == "truth":
-        other = topic.message_type == _TRANSFORM or topic.message_type in converters_of("odometry")
+        other = topic.message_type in (_TRANSFORM, POINT) or topic.message_type in converters_of("odometry")
         return _says_truth(topic.name) or not (other or _NOT_TRUTH.search(topic.name))
     if role == "odometry":
         return not _says_truth(topic.name)

@@ -13,6 +13,7 @@ from fgloc.frames import quaternion_matrix, quaternion_yaw, roll_pitch, rpy_matr
 from fgloc.recording.reader import Recording
 from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
 
+_MOVED_M = 0.1  # no jitter at rest reaches it
 SLIPPING_TOPIC = "/truth/slipping"
 """Whether a wheel slips, in recordings of the simulator (std_msgs/Bool, stamped by its receipt)."""
 
@@ -33,6 +34,11 @@ def base_ground(event: TruthEvent, config: TruthConfig) -> FloatArray:
     height = float(event.position[2] - R[2, :2] @ np.asarray(config.offset_m))
     roll, pitch = roll_pitch(R)
     return np.array([height, roll, pitch])
+
+
+def lacks_yaw(poses: FloatArray) -> bool:
+    """Whether poses ``(n, 3)`` are of positions alone: they move, and their yaw never changes by a bit."""
+    return len(poses) > 1 and not np.ptp(poses[:, 2]) > 0.0 and float(np.ptp(poses[:, :2], axis=0).max()) > _MOVED_M
 
 
 def true_slips(recording: Recording) -> IntArray:

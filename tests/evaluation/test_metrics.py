@@ -242,9 +242,9 @@ def test_a_truth_without_a_yaw_is_no_body_that_is_turned(truth: str, named: bool
     yaw = 1.2 + 0.1 * np.sin(t)
     path = np.cumsum(0.1 * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0)
     true = {"of its own": yaw, "turned": yaw - 0.5, "none": np.zeros(len(t))}[truth]
-    matched = Matched(
-        np.arange(len(t)), np.column_stack([path, yaw]), np.column_stack([path + 0.01, true]), None, np.zeros(3)
-    )
+    stamps = np.round(1e9 * t).astype(np.int64)
+    estimate = Trajectory(stamps, np.column_stack([path, yaw]))
+    matched = match(estimate, Trajectory(stamps, np.column_stack([path + 0.01, true])))
     finding = metrics._turned(Config(), matched)
     assert (finding is not None) is named
     if finding is not None:

@@ -24,7 +24,7 @@ from fgloc.files.outputs import read_tum
 from fgloc.frames import rotations
 from fgloc.intake.keyframing import EventBuffer
 from fgloc.recording.reader import open_recording
-from fgloc.recording.truth import base_ground, base_pose
+from fgloc.recording.truth import base_ground, base_pose, lacks_yaw
 from fgloc.sensor_setup import mounted_up
 from fgloc.sensors.base import Mounting, WheelJoints
 from fgloc.sensors.commands import told
@@ -333,6 +333,11 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
     for kind, count in (("commands", sum(isinstance(e, ControlEvent) for e in sensed)), ("truth", len(stamps))):
         if count < 2:
             raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
+    if lacks_yaw(rows):
+        raise RecordingError(
+            f"{path}: the truth has positions and no yaw, which identification needs; smooth the recording and give "
+            "its folder as the truth of the training"
+        )
     return _Recorded(settings, sensed, (stamps, rows), up)
 
 

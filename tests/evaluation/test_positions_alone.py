@@ -1,0 +1,91 @@
+"""A truth of positions without a yaw, as a total station's: what it judges, and what it does not."""
+
+import math
+
+import numpy as np
+import pytest
+from command_line import fgloc
+from refusal import refusal
+
+from fgloc import run, se2
+from fgloc.ablation.jobs import start_at_truth
+from fgloc.calibrate import calibrate
+from fgloc.config import Config
+from fgloc.errors import EstimatorError, RecordingError
+from fgloc.evaluation.metrics import compute_metrics, match_result
+from fgloc.evaluation.report import write_results
+from fgloc_datasets.bag import BagWriter
+
+START_NS = 1_700_000_000_000_000_000
+LEVER = (0.3, -0.2)
+T_MAP_TRUTH = (2.0, -1.0, 0.8)  # frame of the total station
+
+
+def write(folder, topic="/total_station/truth", lever=LEVER):
+    """A robot on a circle with odometry and commands; a prism beside its base is tracked at 10 Hz."""
+    point_type, header_type = "geometry_msgs/msg/PointStamped", "std_msgs/msg/Header"
+    with BagWriter(folder / "bag") as bag:
+        for k in range(400):
+            stamp, angle = START_NS + k * 50_000_000, 0.02 * k
+            pose = (math.sin(angle), 1.0 - math.cos(angle), angle)
+            bag.odometry("/odom", stamp, pose, (0.4, 0.4), stamp, (np.eye(6) * 1e-3, np.eye(6) * 1e-3))
+            bag.command("/cmd_vel", stamp, 0.4, 0.4, stamp)
+            if k % 2 == 0:
+                x, y = se2.compose(se2.inverse(T_MAP_TRUTH), se2.compose(pose, (*lever, 0.0)))[:2].tolist()
+                time = bag.make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+                header = bag.make(header_type, stamp=time, frame_id="station")
+                point = bag.make("geometry_msgs/msg/Point", x=x, y=y, z=0.4)
+                bag.write(topic, point_type, bag.make(point_type, header=header, point=point), stamp)
+    return folder / "bag"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("positions"))
+
+
+def settings(align="se2", offset=LEVER):
+    return Config.model_validate({"truth": {"align": align, "offset_m": list(offset)}})
+
+
+@pytest.mark.parametrize("mode", ["online", "batch"])
+def test_positions_are_compared_with_the_lever_arm_and_the_yaw_is_not(bag, tmp_path, mode):
+    result = run(bag, None, settings(), mode)
+    metrics = compute_metrics(result, settings())
+    assert metrics.ate_rmse_m < 0.01
+    assert metrics.yaw_mae_deg is None
+    assert metrics.nees_over_3 < 1.0
+    assert set(metrics.coverage) == {"1", "2", "3"}
+    assert not [f for f in metrics.findings if f.code in ("truth.mounting", "covariance.optimistic")]
+    matched = match_result(result, settings())
+    assert not matched.has_yaw
+    np.testing.assert_allclose(matched.errors[:, 2], 0.0)
+    write_results(result, settings(), tmp_path / "out", "fgloc")
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+
+
+def test_a_lever_arm_that_is_not_given_is_an_error_of_positions(bag):
+    config = settings(offset=(0.0, 0.0))
+    assert compute_metrics(run(bag, None, config, "online"), config).ate_rmse_m > 0.05
+
+
+def test_without_alignment_the_error_is_in_the_maps_frame(bag):
+    config = settings("none")
+    initial = (*se2.inverse(T_MAP_TRUTH)[:2].tolist(), -T_MAP_TRUTH[2])
+    config = config.model_copy(update={"estimator": config.estimator.model_copy(update={"initial_pose": initial})})
+    metrics = compute_metrics(run(bag, None, config, "online"), config)
+    assert metrics.ate_rmse_m < 0.01
+    assert metrics.yaw_mae_deg is None
+
+
+def test_points_are_no_truth_unless_their_topic_says_so(tmp_path):
+    code, out, _ = fgloc("info", write(tmp_path, topic="/clicked_point"))
+    assert code == 0
+    assert "recording.topics.truth: /clicked_point" in out
+
+
+def test_what_needs_a_yaw_refuses_a_truth_without_one(bag):
+    with refusal(RecordingError, bag, "estimator.initial_pose"):
+        start_at_truth(bag, settings())
+    with refusal(EstimatorError, bag, "yaw"):
+        calibrate([bag], None, settings())
