@@ -45,6 +45,11 @@ def bag(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def short_bag(tmp_path_factory):
+    return write_world(tmp_path_factory.mktemp("short"), World(room(), seed=1, seconds=3.0, rate=5))
+
+
+@pytest.fixture(scope="module")
 def found(bag):
     return survey([bag], settings())
 
@@ -146,6 +151,14 @@ def test_given_markers_make_the_frame_and_are_refined(bag):
     assert np.mean(np.abs(off) < 3.0 * sigma) > 0.95
     assert all(np.trace(seen.landmarks[i].cov) < np.trace(m.cov) for i, m in given.items() if i != 40)
     assert not made.errors
+
+
+def test_of_given_markers_the_one_that_is_moved_most_is_named_if_it_is_moved_too_far(short_bag):
+    given = part({1, 2, 3, 4}).landmarks
+    wrong = {**given, 3: dataclasses.replace(given[3], position=given[3].position + np.array([0.0, 0.3, 0.0]))}
+    assert not survey([short_bag], settings(), LandmarkMap(given, "DICT_4X4_50")).errors
+    (error,) = survey([short_bag], settings(), LandmarkMap(wrong, "DICT_4X4_50")).errors
+    assert "marker 3 " in error
 
 
 def test_given_markers_that_cannot_be_where_they_are_said_to_be_are_named(bag, tmp_path):
@@ -251,6 +264,14 @@ def test_markers_whose_place_or_direction_is_hardly_known_are_left_out(tmp_path)
     assert sigmas[:, :3].max() < 0.1
     assert sigmas[:, 3:].max() < 0.2
     assert {1, 6} <= made.left_out.keys()
+
+
+def test_a_marker_whose_place_is_known_and_its_direction_hardly_is_left_out(short_bag):
+    made = survey([short_bag], settings(markers={"sigma_px": 2.5}), part({2, 3}))
+    assert sorted(made.landmarks.landmarks) == [2, 3]
+    known = re.search(r"\b(\d+) cm and (\d+) degrees", made.left_out[1])
+    assert int(known[1]) < 9
+    assert 11 < int(known[2]) < 20
 
 
 def test_what_is_missing_is_said(bag, tmp_path):

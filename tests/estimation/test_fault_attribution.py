@@ -16,7 +16,7 @@ from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import ControlEvent
 
 
-def driven(folder, model=1.0, wheels=1.0, during_s=(0.0, 60.0), blind=()):
+def driven(folder, model=1.0, wheels=1.0, during_s=(0.0, 60.0), blind=(), seconds=24.0):
     """A world, the localizer, and the estimates of its drive.
 
     The model takes commands for motion, as the world's robot follows them; ``model`` and ``wheels`` times the true
@@ -33,7 +33,7 @@ def driven(folder, model=1.0, wheels=1.0, during_s=(0.0, 60.0), blind=()):
             return replace(e, v=model * e.v)
         return replace(e, linear=wheels * e.linear) if isinstance(e, OdometryEvent) else e
 
-    made = World(room(), seconds=24.0, blind=blind)
+    made = World(room(), seconds=seconds, blind=blind)
     chain = Chain(config(), made.map, learned=learned)
     return made, chain.localizer, chain.run(said(e) for e in made.events())
 
@@ -72,6 +72,18 @@ def test_without_sightings_it_is_the_wheels(tmp_path):
     _, _, estimates = driven(tmp_path, wheels=1.5, during_s=(10.0, 14.0), blind=((8.0, 16.0),))
     assert left_out(estimates, "wheels", (10.5, 13.5)) == 1.0
     assert left_out(estimates, "learned", (8.0, 16.0)) == 0.0
+
+
+def test_wheels_are_left_out_back_to_where_their_slip_began_though_it_shows_later(tmp_path):
+    _, localizer, estimates = driven(tmp_path, wheels=1.4, during_s=(3.0, 9.0), blind=((2.5, 9.0),), seconds=4.5)
+    began_ns = START_NS + 3_000_000_000
+    told_ns = next(e.stamp_ns for e in estimates for d in e.decisions if d.reason == "slip")
+    frames = [f for f in localizer.estimator.log.keyframes.values() if f.prior is None]
+    before = [[m.source for m in f.motions] for f in frames if f.stamp_ns <= began_ns]
+    unnoticed = [[m.source for m in f.motions] for f in frames if began_ns + 100_000_000 < f.stamp_ns < told_ns]
+    assert before == [["wheels", "learned"]] * len(before)
+    assert unnoticed == [["learned"]] * len(unnoticed)
+    assert min(len(before), len(unnoticed)) > 0
 
 
 def test_a_model_that_agrees_again_is_used_again(tmp_path):

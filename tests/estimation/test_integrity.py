@@ -328,3 +328,27 @@ def test_a_turn_that_a_gyro_nearly_tells_makes_no_knock_less_probable():
 
     assert share(0.0) == pytest.approx(5e-5, rel=0.01)
     assert share(0.2) == pytest.approx(0.25, rel=0.01)
+
+
+def test_a_change_of_a_mounting_is_taken_up_only_when_it_has_lasted_for_seconds():
+    robot, found = Straight(), None
+    for step in range(1, 16):
+        robot.drive(knocked=(0.0, 0.0, 0.06 if step > 2 else 0.0))
+        found = robot.modes.changed()
+        if found is not None:
+            break
+    assert found is not None
+    assert robot.likeliest()[0] > 0.999
+    assert step * 500_000_000 - found.since_ns == 5_000_000_000
+
+
+def test_images_that_are_far_off_at_once_are_no_change_of_a_mounting_until_others_agree():
+    """A pose known to millimetres; the camera saw little at first, and then the robot turned by 0.3 rad."""
+    modes, taken_up = MountModes(3), []
+    for stamp_s, sigma, off in ((0.0, 1.0, 0.0), (1.0, 1.0, 0.0), *((7.0 + 0.1 * k, 0.002, 0.3) for k in range(6))):
+        H = np.eye(3) / sigma
+        W = np.linalg.inv(np.linalg.cholesky(H @ COV @ H.T + np.eye(3)))
+        modes.take(round(stamp_s * 1e9), H, W, W @ H @ [0.0, 0.0, off], np.zeros((3, 3)), ["corners"] * 3)
+        modes.weigh()
+        taken_up.append(modes.changed() is not None)
+    assert taken_up == [False] * 6 + [True] * 2

@@ -2,19 +2,23 @@
 
 import dataclasses
 import os
+import queue
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from itertools import takewhile
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from event_makers import image, joints
+from event_makers import image, joints, odometry
 from live_feed import PATIENCE_S, ROLES, errors, feed, live_in
 from robot_world import CAMERA, START_NS, World, beacons, config, nees, room, truth_at
 from world_bags import write_world
@@ -23,7 +27,8 @@ import fgloc
 from fgloc.config import Config, TopicsConfig, load_config, yaml_of
 from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
-from fgloc.live.engine import DetectionWorker, Queued, State
+from fgloc.live import process as estimation_process
+from fgloc.live.engine import DetectionWorker, Keep, LiveStatus, Queued, Settings, State
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
@@ -111,6 +116,85 @@ def test_in_a_process_of_its_own_the_run_is_the_same(tmp_path):
     assert not [t for t in threading.enumerate() if t.name.startswith("fgloc-")]
     with pytest.raises(EstimatorError, match="closed"):
         live.push(world.events()[0])
+
+
+@pytest.fixture
+def in_a_thread(monkeypatch):
+    """A process of the estimation whose child is a thread of this one; and when each event came there, by a queue."""
+    came = queue.Queue()
+
+    class Heard:
+        """Estimation that notes when events come, and answers."""
+
+        def __init__(self, settings, outlet):
+            pass
+
+        def put(self, events):
+            for event in events:
+                came.put((time.monotonic(), event.stamp_ns))
+
+        def wait(self, timeout_s):
+            return timeout_s == 7.0
+
+        def begin_again(self, keep, source):
+            raise EstimatorError(keep.name)
+
+        def close(self):
+            pass
+
+        def status(self):
+            return LiveStatus(keyframes=5)
+
+    class Child:
+        def __init__(self, arguments, **options):
+            self._end = socket.socket(fileno=os.dup(int(arguments[3])))
+            self._thread = threading.Thread(target=self._run)
+            self._thread.start()
+
+        def _run(self):
+            with Connection(os.dup(self._end.fileno())) as connection, suppress(SystemExit):
+                estimation_process._Worker(connection).run()
+
+        def kill(self):
+            self._end.shutdown(socket.SHUT_RDWR)
+
+        def wait(self):
+            self._thread.join()
+            self._end.close()
+
+    monkeypatch.setattr(estimation_process, "Estimation", Heard)
+    monkeypatch.setattr(estimation_process.subprocess, "Popen", Child)
+    monkeypatch.setattr(estimation_process.os, "_exit", sys.exit)
+    monkeypatch.setattr(estimation_process.gc, "freeze", lambda: None)
+    estimation = estimation_process.EstimationProcess()
+    estimation.begin(Settings(Config(), None, None, None, None), None)
+    yield estimation, came
+    estimation.close()
+
+
+def test_motion_reaches_the_process_of_the_estimation_after_a_moment_however_long_there_was_none(in_a_thread):
+    estimation, came = in_a_thread
+    took_s = []
+    for k in range(8):
+        time.sleep(0.05)
+        began = time.monotonic()
+        estimation.put([odometry(1.0 + k)])
+        when, stamp_ns = came.get(timeout=10.0)
+        assert stamp_ns == (1 + k) * 10**9
+        took_s.append(when - began)
+    assert min(took_s) < 0.15  # of many, as this machine may be busy
+
+
+def test_questions_to_the_process_of_the_estimation_are_answered_or_fail_as_there(in_a_thread):
+    estimation, came = in_a_thread
+    assert estimation.wait(7.0)
+    assert not estimation.wait(6.0)
+    with pytest.raises(EstimatorError, match=r"^INSTALLATION$"):
+        estimation.begin_again(Keep.INSTALLATION)
+    estimation.put([odometry(1.0)])
+    estimation.close()
+    assert came.qsize() == 1  # what was put before is used
+    assert estimation.status().keyframes == 5
 
 
 def test_an_estimation_process_that_ends_or_fails_is_told():
@@ -510,6 +594,15 @@ def test_the_status_says_how_the_topics_come_in():
     assert 0.0 < status.step_ms <= status.step_ms_max <= took_ms
     assert 0.0 <= status.reordering_s < 0.2
     assert status.keyframes > 30
+
+
+def test_no_update_takes_longer_than_all_of_the_run():
+    world, began = World(beacons(), seconds=1.0), time.perf_counter()
+    with live_in(world) as live:
+        feed(live, world.events())
+        status = live.status()
+    took_ms = 1e3 * (time.perf_counter() - began)
+    assert 0.0 < status.step_ms <= status.step_ms_max < took_ms
 
 
 def test_the_example_runs(tmp_path):

@@ -134,6 +134,34 @@ def test_fault_69_publishers_of_any_quality_of_service_are_heard(reliable):
         assert wait_until(heard)
 
 
+class Offered:
+    """Network on which others publish these topics; ``latched`` is what is read of it, and how."""
+
+    def __init__(self, types):
+        self._types, self.latched = types, {}
+
+    def full_name(self, name):
+        return name.replace("~", "/fgloc")
+
+    def publications(self):
+        return tuple(Publication(topic, kind) for topic, kind in self._types.items())
+
+    def has_volatile(self, topic):
+        return False
+
+    def read(self, topic, message_type, on_message, latched=False):
+        self.latched[topic] = latched
+
+
+def test_static_transforms_are_read_as_they_were_told_before_and_nothing_else_is():
+    frames = dict.fromkeys(("/tf", "/tf_static"), "tf2_msgs/msg/TFMessage")
+    network = Offered({"/odom": "nav_msgs/msg/Odometry", "/image_raw": IMAGE} | frames)
+    intake = Intake(network, None, RecordingConfig(), None)
+    assert wait_until(lambda: not intake.find() and bool(intake.roles))
+    intake.subscribe()
+    assert network.latched == {"/tf_static": True, "/tf": False, "/odom": False, "/image_raw": False}
+
+
 def test_a_participant_waits_for_messages_rather_than_look_for_them_all_the_time(monkeypatch):
     looks = []
     monkeypatch.setattr("fgloc.live.wire.participant.in_order", lambda queues: looks.append(queues) or [])
