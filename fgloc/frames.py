@@ -38,12 +38,16 @@ def quaternion_matrix(quaternion: Sequence[float] | FloatArray) -> FloatArray:
     )
 
 
+def homogeneous(rotation: FloatArray, translation: Sequence[float] | FloatArray = (0.0, 0.0, 0.0)) -> FloatArray:
+    """Homogeneous ``(4, 4)`` of a rotation matrix ``(3, 3)`` and a translation [m]."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, translation
+    return T
+
+
 def transform_matrix(translation: Sequence[float] | FloatArray, quaternion: Sequence[float] | FloatArray) -> FloatArray:
     """Homogeneous ``(4, 4)`` of a translation [m] and a unit quaternion x, y, z, w."""
-    T = np.eye(4)
-    T[:3, :3] = quaternion_matrix(quaternion)
-    T[:3, 3] = translation
-    return T
+    return homogeneous(quaternion_matrix(quaternion), translation)
 
 
 def rotation_of(vector: Sequence[float] | FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import Found, found_values
 from fgloc.config import Config, base_roles
 from fgloc.errors import ConfigError, MapError, RecordingError
+from fgloc.frames import homogeneous
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
@@ -263,9 +264,8 @@ def _agreed(views: list[tuple[int, float, list[FloatArray]]]) -> Guess:
             break
         turned = np.linalg.norm(both[..., :3, :3] - best[:3, :3], axis=(2, 3))
         chosen = both[np.arange(len(both)), np.where(near, turned, np.inf).argmin(axis=1)][near.any(axis=1)]
-        best = np.eye(4)
-        best[:3, 3] = np.median(chosen[:, :3, 3], axis=0)
-        best[:3, :3] = Rotation.from_matrix(chosen[:, :3, :3]).mean().as_matrix()
+        mean = Rotation.from_matrix(chosen[:, :3, :3]).mean().as_matrix()
+        best = homogeneous(mean, np.median(chosen[:, :3, 3], axis=0))
     support = np.flatnonzero(_near(best, both, depths).any(axis=1))
     return Guess(best, frozenset(views[i][0] for i in support), len(views))
 
@@ -793,7 +793,7 @@ def _joined(
     drives: Sequence[Drive], sizes: Mapping[int, float], anchors: Mapping[int, Landmark], least: int
 ) -> tuple[list[Leg], dict[int, Landmark], dict[int, str]]:
     """Drives and markers in one frame: that of the anchors, else of the first drive; and what is left out."""
-    known = {i: _matrix(m) for i, m in anchors.items()}
+    known = {i: homogeneous(m.rotation, m.position) for i, m in anchors.items()}
     legs: list[Leg] = []
     left_out: dict[int, str] = {}
     waiting = []
@@ -828,12 +828,6 @@ def _joined(
 
 def _agreeing(guesses: Mapping[int, Guess]) -> dict[int, frozenset[int]]:
     return {i: g.agreeing for i, g in guesses.items()}
-
-
-def _matrix(landmark: Landmark) -> FloatArray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = landmark.rotation, landmark.position
-    return T
 
 
 def _missed(d: Distance, sigmas: float) -> str:

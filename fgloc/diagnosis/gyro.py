@@ -13,7 +13,7 @@ from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.handling import Span, cut, handling, outside
 from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit
 from fgloc.diagnosis.signals import Path
-from fgloc.frames import rotation_of, sensor_pose
+from fgloc.frames import homogeneous, rotation_of, sensor_pose
 from fgloc.types import FloatArray, Severity
 
 _SHARED = 0.9  # share of a turn that another explains: one measurement
@@ -125,8 +125,7 @@ def _pose_for(up: FloatArray) -> list[float]:
     """``recording.imu_pose`` of an IMU whose axis ``up (3,)`` points upwards, by the least turn."""
     across = np.cross(up, [0.0, 0.0, 1.0])
     size = float(np.linalg.norm(across))
-    T = np.eye(4)
-    T[:3, :3] = rotation_of(math.atan2(size, float(up[2])) * (across / size if size > 1e-9 else np.eye(3)[0]))
+    T = homogeneous(rotation_of(math.atan2(size, float(up[2])) * (across / size if size > 1e-9 else np.eye(3)[0])))
     return [0.0, 0.0, 0.0, *(round(v, 4) + 0.0 for v in sensor_pose(T, optical=False)[3:])]
 
 

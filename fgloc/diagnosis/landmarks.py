@@ -25,7 +25,7 @@ from fgloc.diagnosis.landmark_fits import (
 )
 from fgloc.diagnosis.pairs import SKID, TELLS, TURN, Figure, RateFit, varied
 from fgloc.diagnosis.signals import Path, Sightings
-from fgloc.frames import rpy_matrix, sensor_pose
+from fgloc.frames import homogeneous, rpy_matrix, sensor_pose
 from fgloc.types import Finding, FloatArray, Severity
 
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
@@ -239,8 +239,7 @@ def _best(fits: Mapping[str, Mounting]) -> Mounting:
 
 def _pose_of(m: Mounting, T_given: FloatArray) -> list[float]:
     """x, y, z, roll, pitch, yaw of a mounting as ``recording.sightings_pose`` has it; the place if it is known."""
-    T = np.eye(4)
-    T[:3, :3] = rpy_matrix(0.0, 0.0, m.yaw.value) @ rotation_to_base(m.axes)
+    T = homogeneous(rpy_matrix(0.0, 0.0, m.yaw.value) @ rotation_to_base(m.axes))
     T[2, 3] = T_given[2, 3]
     for k, figure in ((0, m.x), (1, m.y)):
         T[k, 3] = figure.value if figure.sigma < 0.5 * _PLACED_M else T_given[k, 3]

@@ -14,6 +14,7 @@ from fgloc import se2
 from fgloc.config import CameraConfig
 from fgloc.errors import CameraError
 from fgloc.files.documents import Item, read_document
+from fgloc.frames import homogeneous
 from fgloc.types import Camera, CameraInfoEvent, FloatArray, Landmark
 
 # What ROS, OpenCV and Kalibr call the models. The number of coefficients tells plumb_bob and rational_polynomial apart.
@@ -261,8 +262,7 @@ def marker_pose_candidates(
     back = np.diag([1.0, -1.0, -1.0]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     found = []
     for r, t in zip(rotations, translations, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(r)[0] @ back, np.asarray(t).ravel()
+        T = homogeneous(cv2.Rodrigues(r)[0] @ back, np.asarray(t, dtype=np.float64).ravel())
         points = _square(size_m) @ T[:3, :3].T + T[:3, 3]
         if np.isfinite(T).all() and points[:, 2].min() > _MIN_DEPTH_M:
             found.append((T, _rms(_project(ideal.K, points) - corners)))
@@ -302,8 +302,7 @@ def planar_base_candidates(camera: Camera, corners: FloatArray, landmark: Landma
     if landmark.size_m <= 0.0:
         return []
     ideal, pixels = without_distortion(camera, corners)
-    T_map_marker = np.eye(4)
-    T_map_marker[:3, :3], T_map_marker[:3, 3] = landmark.rotation, landmark.position
+    T_map_marker = homogeneous(landmark.rotation, landmark.position)
     T_cam_base = np.linalg.inv(camera.T_base_cam)
     found: list[tuple[FloatArray, float]] = []
     for T_cam_marker, _ in marker_pose_candidates(camera, corners, landmark.size_m):

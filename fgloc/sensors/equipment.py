@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import Config
-from fgloc.frames import rotation_of
+from fgloc.frames import homogeneous, rotation_of
 from fgloc.sensors import registry
 from fgloc.sensors.base import Sensor
 from fgloc.sensors.gyro import Attitude, Gyro
@@ -157,9 +157,8 @@ _SHORT_NS = 100_000_000  # over so short a time the rate of turn is that at the 
 
 def _tilt(rates: FloatArray, seconds: float) -> FloatArray:
     """Tilt ``(4, 4)`` of the base in a time, by its roll and pitch rates ``(2,)``; none over a long one."""
-    T = np.eye(4)
-    T[:3, :3] = rotation_of((*(rates * (seconds if abs(seconds) < 1e-9 * _SHORT_NS else 0.0)).tolist(), 0.0))
-    return T
+    turned = rates * (seconds if abs(seconds) < 1e-9 * _SHORT_NS else 0.0)
+    return homogeneous(rotation_of((*turned.tolist(), 0.0)))
 
 
 class MotionCompensation:

@@ -35,7 +35,7 @@ from fgloc.config import Config
 from fgloc.errors import ConfigError, MapError
 from fgloc.files.atomic import atomic_file
 from fgloc.files.documents import Item, read_document
-from fgloc.frames import quaternion_matrix, rotation_of, rpy_matrix
+from fgloc.frames import homogeneous, quaternion_matrix, rotation_of, rpy_matrix
 from fgloc.sensors.markers.detector import load_dictionary
 from fgloc.types import MAX_LANDMARK_ID, Board, FloatArray, Grave, Landmark, LandmarkMap
 
@@ -455,10 +455,8 @@ def _tagslam(path: Path, root: Item, bodies: Item, builder: _Builder) -> Landmar
 
 
 def _tagslam_pose(pose: Item) -> FloatArray:
-    T = np.eye(4)
-    T[:3, 3] = _xyz(pose.need("position"))
-    T[:3, :3] = rotation_of(_xyz(pose.need("rotation")))
-    return T
+    position = _xyz(pose.need("position"))
+    return homogeneous(rotation_of(_xyz(pose.need("rotation"))), position)
 
 
 def _wpilib(path: Path, root: Item, tags: Item, builder: _Builder) -> LandmarkMap:

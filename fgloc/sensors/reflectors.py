@@ -24,6 +24,7 @@ from pydantic import Field
 
 from fgloc.config import Config, GateConfig, Section
 from fgloc.errors import ConfigError
+from fgloc.frames import homogeneous, rpy_matrix
 from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, Stream, When
 from fgloc.sensors.measurements import UNNAMED, LandmarkMeasurement, PointMeasurement
 from fgloc.types import Event, FloatArray, SensorEvent
@@ -210,13 +211,6 @@ def _first_section(look: FirstLook) -> FirstSection:
     return FirstSection(tuple(lines), (place,) if asked and not placed else ())
 
 
-def _planar(pose: tuple[float, float, float]) -> FloatArray:
-    """Transform ``(4, 4)`` of x, y [m], yaw [rad]."""
-    T, c, s = np.eye(4), math.cos(pose[2]), math.sin(pose[2])
-    T[:2, :2], T[:2, 3] = [[c, -s], [s, c]], pose[:2]
-    return T
-
-
 # --- The sensor -------------------------------------------------------------------------------------------------------
 
 
@@ -290,8 +284,8 @@ class Reflectors:
     def _place(self, frame_id: str) -> FloatArray:
         """``T_base_scanner (4, 4)``."""
         if frame_id not in self._places:
-            given = self._config.pose
-            T = self._frame(frame_id) if given is None else _planar(given)
+            at = self._config.pose
+            T = self._frame(frame_id) if at is None else homogeneous(rpy_matrix(0.0, 0.0, at[2]), (*at[:2], 0.0))
             if T is None:
                 self._notes.setdefault(
                     f"No transform to the laser scanner's frame {frame_id!r}: taken to be at the base; set "
