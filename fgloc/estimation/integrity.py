@@ -208,6 +208,8 @@ class ProtectionLevels:
             faults = [off, *faults, *(f.beside(off) for f in faults)]
         sound = _OVERBOUND * np.sqrt(_directions(cov))
         bound, cause = self._least(sound, faults)
+        if bound[2] > 0.5 * math.pi:  # nobody knows which way is along: what lies there may lie across
+            bound = np.array([*np.maximum(bound[:2], bound[3]), min(float(bound[2]), math.pi), bound[3]])
         return Protection(bound[:3], float(bound[3]), cause, self._is_alert(float(bound[3]), float(bound[2])))
 
     def _slip(

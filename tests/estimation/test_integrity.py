@@ -1,5 +1,7 @@
 """Bounds on the error: they hold the risk, grow with what may be wrong, and say what they are due to."""
 
+import math
+
 import numpy as np
 import pytest
 from robot_world import Chain, World, config, room
@@ -195,10 +197,21 @@ def test_a_slip_that_the_last_fix_showed_may_go_on():
 
 def test_a_robot_that_may_have_been_carried_away_is_bounded_by_the_hall():
     found = ProtectionLevels(IntegrityConfig(), Modes()).of(
-        COV, DRIVES, 0.0, False, carried=(0.01, np.diag(np.square([4.0, 4.0, 1.8])))
+        COV, DRIVES, 0.0, False, carried=(0.01, np.diag(np.square([4.0, 4.0, 0.1])))
     )
     assert found.cause == "carried away"
     assert 0.01 * 2.0 * norm.sf(found.bound[0] / 4.0) == pytest.approx(1e-3 / 360.0 / 3.0, rel=0.05)
+
+
+def test_without_a_yaw_nothing_is_along_or_across():
+    """A robot whose yaw nobody knows: each axis is bounded as the distance is, and the yaw by half a turn."""
+    cov = np.diag(np.square([1.0, 0.01, 1.5]))
+    found = ProtectionLevels(IntegrityConfig(), Modes()).of(cov, DRIVES, 0.0, False)
+    assert found.bound[2] == math.pi
+    assert found.bound[:2].tolist() == [pytest.approx(found.position_m)] * 2
+    known = ProtectionLevels(IntegrityConfig(), Modes()).of(np.diag(np.square([1.0, 0.01, 0.1])), DRIVES, 0.0, False)
+    assert known.bound[1] < 0.1 < known.bound[0] <= known.position_m
+    assert known.position_m == pytest.approx(found.position_m)
 
 
 def test_in_the_dark_a_slip_may_go_unseen_and_less_of_it_between_two_sources():
