@@ -422,7 +422,7 @@ class TopicsConfig(Section):
     @property
     def of_joints(self) -> tuple[str, ...]:
         """Topics of any type in which `recording.joints` names fields, the first one being that of the role."""
-        return self._of_joints
+        return () if self.joints == "none" else self._of_joints
 
     @property
     def of_cameras(self) -> Mapping[Role, str | None]:
@@ -443,6 +443,8 @@ class TopicsConfig(Section):
         if role in self._cameras:
             return self._cameras[role]
         given: str | None = getattr(self, role, None)
+        if role == "joints" and given is None and self._of_joints:
+            return self._of_joints[0]
         if given is None and role in optional_roles() and role not in self._asked:
             return "none"
         return "none" if given is None and self._cameras and role in CAMERA_ROLES else given
@@ -543,10 +545,12 @@ class RecordingConfig(Section):
     @model_validator(mode="after")
     def _with_topic_of_joints(self) -> RecordingConfig:
         topics = tuple(dict.fromkeys(joint.topic for joint in self.joints.values()))
-        if topics and self.topics.joints not in (None, *topics):
-            raise ValueError(f"topics.joints is {self.topics.joints}, expected none of it beside recording.joints")
-        if topics:
-            read = self.topics.model_copy(update={"joints": topics[0]})
+        if topics and self.topics.joints not in (None, "none", topics[0]):
+            raise ValueError(
+                f"topics.joints is {self.topics.joints}, expected no topic beside recording.joints, or none"
+            )
+        if topics != self.topics._of_joints:
+            read = self.topics.model_copy()
             read._of_joints = topics
             self.__dict__["topics"] = read
         return self

@@ -193,6 +193,7 @@ class TruthEvent(Event):
     frame_id: str
     position: FloatArray  # (3,)
     orientation: FloatArray  # (4,) quaternion x, y, z, w
+    has_yaw: bool = True  # False: the orientation says nothing
 
 
 # --- Steps: all events between two keyframes --------------------------------------------------------------------------
@@ -556,6 +557,7 @@ class Trajectory:
     covs: FloatArray | None = None  # (n, 3, 3)
     ground: FloatArray | None = None  # (n, 3) height, roll and pitch; None: the floor is flat, or not known
     ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw in the map frame
+    has_yaw: bool = True  # False: a truth of positions of the point that is tracked; the yaw says nothing
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -30,7 +30,7 @@ from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
 from fgloc.files.outputs import sha256_of, write_json, write_text
 from fgloc.recording.reader import open_recording
-from fgloc.recording.truth import base_pose, lacks_yaw
+from fgloc.recording.truth import base_pose
 from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.failures import Scene
@@ -375,10 +375,9 @@ def start_at_truth(bag: Path, config: Config) -> Config:
         RecordingError: the recording has no truth.
     """
     with open_recording(bag, config.recording) as recording:
-        truth = [event for event in recording.events() if isinstance(event, TruthEvent)]
-    if lacks_yaw(np.array([base_pose(event, config.truth) for event in truth]).reshape(-1, 3)):
+        first = next((event for event in recording.events() if isinstance(event, TruthEvent)), None)
+    if first is not None and not first.has_yaw:
         raise RecordingError(f"{bag}: the truth has no yaw to start with; give estimator.initial_pose")
-    first = next(iter(truth), None)
     if first is None:
         raise RecordingError(f"{bag}: no truth to start from; use 'start: configured' and estimator.initial_pose")
     x, y, yaw = base_pose(first, config.truth).tolist()

@@ -295,18 +295,20 @@ def _look(bag: Path) -> _Seen:
         _look_at_optional(bag, config, roles.values(), watch)
         look = FirstLook(info.roles, events, recording, has_map, landmark_map)
         frames = tuple(name for name in BASE_NAMES if name in recording.frames)
-        numbers = () if _WHEELED & roles.keys() else tuple(islice(_numbers(bag), _MOST_NUMBERS))
+        numbers = () if _WHEELED & roles.keys() else _numbers(bag, roles.values())
         return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted), others, numbers)
 
 
-_WHEELED: frozenset[Role] = frozenset({"odometry", "joints", "command"})
+_WHEELED: frozenset[Role] = frozenset({"odometry", "joints"})
 _MOST_NUMBERS = 12  # lines
 
 
-def _numbers(bag: Path) -> Iterator[NumericField]:
+def _numbers(bag: Path, taken: Collection[str]) -> tuple[NumericField, ...]:
+    """Numbers in messages of no other role, those first whose names are of wheels."""
     known = TF_TYPES.union(*map(converters_of, role_names())) - {POINT}
     with closing(Storage(bag)) as storage:
-        yield from unread_numbers(storage, known)
+        found = [number for number in unread_numbers(storage, known) if number.topic not in taken]
+    return tuple(sorted(found, key=lambda number: not number.is_of_wheels))
 
 
 _MOST_OPTIONAL = 500  # messages of such a topic
@@ -392,9 +394,11 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
     if seen.numbers:
         yield "  # Fields that may be wheels' angles (position) or rates (velocity); fill in what is (docs/drives.md):"
         yield "  # joints:"
-    for n in seen.numbers:
+    for n in seen.numbers[:_MOST_NUMBERS]:
         kind = "velocity" if n.is_rate else "position"
         yield f"  #   NAME: {{topic: {n.topic}, {kind}: {n.path}, scale: 1.0}}  # {n.low:.4g} to {n.high:.4g}"
+    if more := len(seen.numbers[_MOST_NUMBERS:]):
+        yield f"  #   and {more} more"
     if seen.frames:
         yield f"  base_frame: {seen.frames[0]}"
     else:

@@ -112,7 +112,7 @@ def _recorded(bag: Path, config: Config) -> _Recorded:
     motion: list[MotionEvent] = []
     rows: list[tuple[float, ...]] = []
     body = config.truth.model_copy(update={"offset_m": (0.0, 0.0), "yaw_offset_rad": 0.0})
-    origin_ns = 0
+    origin_ns, has_yaw = 0, True
     with open_recording(bag, config.recording) as recording:
         for event in recording.events():
             passed = gate.check(event)
@@ -120,13 +120,14 @@ def _recorded(bag: Path, config: Config) -> _Recorded:
                 motion.append(passed)
             elif isinstance(passed, TruthEvent):
                 origin_ns = origin_ns or passed.stamp_ns
+                has_yaw &= passed.has_yaw
                 rows.append(((passed.stamp_ns - origin_ns) * 1e-9, *base_pose(passed, body)))
     table = np.array(rows, dtype=float).reshape(-1, 4)
     table = table[np.unique(table[:, 0], return_index=True)[1]]
     table = table[np.append(True, np.abs(np.diff(table[:, 1:], axis=0)).max(axis=1, initial=0.0) > 0.0)[: len(table)]]
     motion.sort(key=lambda event: event.stamp_ns)
     stamps = np.array([event.stamp_ns for event in motion], dtype=np.int64)
-    if lacks_yaw(table[:, 1:]):
+    if not has_yaw or lacks_yaw(table[:, 1:]):
         raise EstimatorError(f"{bag}: the truth has positions and no yaw; wheels are calibrated by a truth with yaw")
     windows = list(_windows(table[:, 0], origin_ns, stamps))
     if len(windows) < _FEWEST:

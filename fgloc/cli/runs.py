@@ -401,9 +401,12 @@ def evaluate(
     from fgloc.evaluation import metrics
     from fgloc.evaluation.metrics import match
     from fgloc.files.outputs import read_tum
+    from fgloc.recording.truth import lacks_yaw
 
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
-    matched = match(read_tum(estimate), read_tum(truth), kind, max_gap)
+    true = read_tum(truth)
+    true = replace(true, has_yaw=not lacks_yaw(true.poses))
+    matched = match(read_tum(estimate), true, kind, max_gap)
     drift, relative, yaw = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0), matched.has_yaw
     rows = [
         ("poses matched", f"{len(matched.stamps_ns)}"),

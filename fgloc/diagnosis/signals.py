@@ -142,6 +142,7 @@ class Signals:
     motion: list[MotionEvent] = field(default_factory=list)
     imu: list[tuple[float, ...]] = field(default_factory=list)
     truth: list[tuple[float, ...]] = field(default_factory=list)
+    true_yaw: bool = True  # whether the truth has one
     seen: list[tuple[float, ...]] = field(default_factory=list)
     ranges: list[tuple[float, int, float]] = field(default_factory=list)
     odometry: list[tuple[float, ...]] = field(default_factory=list)
@@ -288,6 +289,7 @@ class SignalCollector:
         if isinstance(passed, MotionEvent):
             self.found.motion.append(passed)
         elif isinstance(passed, TruthEvent):
+            self.found.true_yaw &= passed.has_yaw
             self.found.truth.append((at_s, *passed.position.tolist(), *passed.orientation.tolist()))
         elif isinstance(passed, UwbEvent):
             self.found.ranges.append((at_s, passed.anchor, passed.range_m))

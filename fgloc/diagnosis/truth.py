@@ -202,7 +202,7 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
     x, y, turned = se2.inverse((*section.offset_m, section.yaw_offset_rad)).tolist()
     c, s = np.cos(own[:, 3]), np.sin(own[:, 3])
     own[:, 1:] += np.column_stack([c * x - s * y, s * x + c * y, np.full(len(own), turned)])
-    if float(np.ptp(own[:, 3])) < 1e-3 < 0.1 < float(np.ptp(path.poses[:, 2])):
+    if not found.signals.true_yaw or float(np.ptp(own[:, 3])) < 1e-3 < 0.1 < float(np.ptp(path.poses[:, 2])):
         found.add("truth.no_yaw", "The truth has no yaw: only positions are compared", severity=Severity.NOTE)
         return None
     _shared_yaw(found, own)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from fgloc.evaluation.metrics import match, matchable
 from fgloc.evaluation.results import Results, read_results
 from fgloc.evaluation.style import BLUE, GREEN, GREY, NORMAL, ORANGE, RED, SKY, WIDTH, broken, legend, plain_label, tidy
 from fgloc.files.outputs import read_tum
+from fgloc.recording.truth import lacks_yaw
 from fgloc.types import FloatArray, IntArray, Mode, Trajectory
 
 HEAD = (
@@ -119,11 +120,15 @@ def _truth(one: Results) -> Trajectory | None:
     settings = config.get("truth", {}) if isinstance(config, dict) else {}
     align: Literal["none", "se2"] = "se2" if settings.get("align") == "se2" else "none"
     truth = read_tum(path)
+    truth = replace(truth, has_yaw=not lacks_yaw(truth.poses))
+    x, y = settings.get("offset_m", (0.0, 0.0))
     try:
-        T_map_truth = match(one.trajectory, truth, align, float(settings.get("max_gap_s", 0.2))).T_map_truth
+        matched = match(one.trajectory, truth, align, float(settings.get("max_gap_s", 0.2)), (float(x), float(y)))
     except TrajectoryError:  # they share no time
         return None
-    return Trajectory(truth.stamps_ns, se2.compose_array(T_map_truth, truth.poses))
+    if not matched.has_yaw:
+        return Trajectory(matched.stamps_ns, matched.truth)
+    return Trajectory(truth.stamps_ns, se2.compose_array(matched.T_map_truth, truth.poses))
 
 
 def _names(folders: Sequence[Path]) -> list[str]:

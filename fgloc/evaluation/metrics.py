@@ -44,7 +44,9 @@ class Matched:
     truth: FloatArray  # (n, 3)
     covs: FloatArray | None  # (n, 3, 3) of the estimate
     T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
-    has_yaw: bool = True  # False: the truth has positions only, and its yaw here is the estimate's
+    lever: FloatArray | None = (
+        None  # (n, 2) from the base to the point that a truth without yaw tracks; None: it has one
+    )
     ground: FloatArray | None = None  # (n, 3) estimated height, roll and pitch; None: the floor is flat
     true_ground: FloatArray | None = None  # (n, 3); None: not known
     ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw
@@ -58,6 +60,11 @@ class Matched:
         return np.column_stack(
             [planar[:, :2], off[:, 0], se2.wrap_array(off[:, 1]), se2.wrap_array(off[:, 2]), planar[:, 2]]
         )
+
+    @property
+    def has_yaw(self) -> bool:
+        """Whether the truth has a yaw; else that here is the estimate's."""
+        return self.lever is None
 
     @property
     def errors(self) -> FloatArray:
@@ -77,20 +84,20 @@ def match(
     truth: Trajectory,
     align: Literal["none", "se2"] = "none",
     max_gap_s: float = 0.2,
-    T_body_base: FloatArray | None = None,
+    offset_m: tuple[float, float] = (0.0, 0.0),
 ) -> Matched:
     """Bring the truth to the estimate's stamps and, if asked, into its frame.
 
     Equal stamps match exactly; between two stamps of the truth no further apart than `max_gap_s` the truth is
-    interpolated; elsewhere the estimate has no partner and is left out. A truth of positions, whose yaw never changes
-    while the robot turns, is compared by positions alone.
+    interpolated; elsewhere the estimate has no partner and is left out. A truth without a yaw is compared by positions
+    alone, those of the point that it tracks.
 
     Args:
         estimate: poses of the base.
         truth: poses of the base, too.
         align: how the truth is moved into the estimate's frame.
         max_gap_s: see above.
-        T_body_base: ``(3,)`` base in the body that the truth tracks; None: it tracks the base.
+        offset_m: that point in the base frame, of a truth without a yaw.
 
     Raises:
         TrajectoryError: fewer than two poses have a partner.
@@ -105,28 +112,21 @@ def match(
     stamps = estimate.stamps_ns[indices]
     poses = estimate.poses[indices]
     reference = se2.interpolate(truth.stamps_ns, truth.poses, stamps)
-    has_yaw, lever, T_map_truth = not _lacks_yaw(reference, poses), np.zeros((len(poses), 2)), np.zeros(3)
-    if not has_yaw and T_body_base is not None:
-        reference[:, :2] -= se2.compose((0.0, 0.0, reference[0, 2] - T_body_base[2]), T_body_base)[:2]  # of the body
-        lever = se2.compose_array(poses * (0.0, 0.0, 1.0), np.tile(se2.inverse(T_body_base), (len(poses), 1)))[:, :2]
+    T_map_truth = np.zeros(3)
+    points = poses if truth.has_yaw else se2.compose_array(poses, np.tile((*offset_m, 0.0), (len(poses), 1)))
     if align == "se2":
-        T_map_truth = se2.rigid(reference[:, :2], poses[:, :2] + lever)
+        T_map_truth = se2.rigid(reference[:, :2], points[:, :2])
         reference = se2.compose_array(T_map_truth, reference)
-    if not has_yaw:
+    lever = None if truth.has_yaw else points[:, :2] - poses[:, :2]
+    if lever is not None:
         reference = np.column_stack([reference[:, :2] - lever, poses[:, 2]])
     covs = None if estimate.covs is None else estimate.covs[indices]
-    in_space = align == "none" and has_yaw
+    in_space = align == "none" and lever is None
     if not in_space or estimate.ground is None or estimate.ground_covs is None or truth.ground is None:
-        return Matched(stamps, poses, reference, covs, T_map_truth, has_yaw=has_yaw)
+        return Matched(stamps, poses, reference, covs, T_map_truth, lever)
     true = np.column_stack([np.interp(stamps, truth.stamps_ns, column) for column in truth.ground.T])
     ground, spatial = estimate.ground[indices], estimate.ground_covs[indices]
     return Matched(stamps, poses, reference, covs, T_map_truth, ground=ground, true_ground=true, ground_covs=spatial)
-
-
-def _lacks_yaw(truth: FloatArray, poses: FloatArray) -> bool:
-    """Whether a truth's yaw ``(n, 3)`` never changes, while its positions do and the estimate's yaw does."""
-    turned, own = (float(np.ptp(np.unwrap(p[:, 2]))) for p in (truth, poses))
-    return turned < _NO_YAW_RAD < _TURNED_RAD < own and float(np.ptp(truth[:, :2], axis=0).max()) > 0.0
 
 
 def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
@@ -140,7 +140,9 @@ def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
     errors, covs = compared(matched)
     d = errors.shape[1]
     covs = covs + _TRUTH[:d, :d]
-    weights, truth = np.linalg.inv(covs), matched.truth
+    weights, truth, lever = np.linalg.inv(covs), matched.truth.copy(), matched.lever
+    if lever is not None:  # it is the point that the frame moves
+        truth[:, :2] += lever
     for _ in range(_ROUNDS):
         J = np.zeros((len(truth), d, 3))  # of the moved truth by x, y and yaw of the frame
         J[:] = np.eye(3)[:d]
@@ -148,7 +150,9 @@ def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
         H, b = np.einsum("nij,nik,nkl->jl", J, weights, J), np.einsum("nij,nik,nk->j", J, weights, errors)
         step = np.linalg.lstsq(H, b, rcond=None)[0]
         truth = se2.compose_array(step, truth)
-        errors, _ = compared(replace(matched, truth=truth))
+        errors = matched.estimate - truth
+        errors[:, 2] = se2.wrap_array(errors[:, 2])
+        errors = errors if lever is None else errors[:, :2] + lever
         if float(np.abs(step).max()) < 1e-9:
             break
     return errors, covs
@@ -157,8 +161,11 @@ def in_own_gauge(matched: Matched) -> tuple[FloatArray, FloatArray]:
 def compared(matched: Matched) -> tuple[FloatArray, FloatArray]:
     """Errors ``(n, d)`` and their covariances ``(n, d, d)``; d is 3, or 2 where the truth has no yaw."""
     assert matched.covs is not None
-    d = 3 if matched.has_yaw else 2
-    return matched.errors[:, :d], matched.covs[:, :d, :d]
+    if matched.lever is None:
+        return matched.errors, matched.covs
+    J = np.tile(np.eye(2, 3), (len(matched.lever), 1, 1))  # of the point that is tracked
+    J[:, 0, 2], J[:, 1, 2] = -matched.lever[:, 1], matched.lever[:, 0]
+    return matched.errors[:, :2], J @ matched.covs @ J.transpose(0, 2, 1)
 
 
 def matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:
@@ -706,7 +713,7 @@ def odometry_metrics(result: RunData, config: Config, ate_m: float) -> OdometryM
     truth, odometry = result.truth, result.odometry
     if truth is None or odometry is None or len(matchable(odometry, truth, config.truth.max_gap_s)) < FEWEST:
         return None
-    alone = ate_rmse_m(match(odometry, truth, "se2", config.truth.max_gap_s))
+    alone = ate_rmse_m(match(odometry, truth, "se2", config.truth.max_gap_s, config.truth.offset_m))
     return OdometryMetrics(ate_rmse_m=alone, ate_over_odometry=ate_m / alone if alone > 0.0 else None)
 
 
@@ -715,8 +722,7 @@ def match_result(result: RunData, config: Config) -> Matched | None:
     truth = result.truth
     if truth is None or len(truth) == 0 or len(matchable(result.trajectory, truth, config.truth.max_gap_s)) < FEWEST:
         return None
-    T_body_base = se2.inverse((*config.truth.offset_m, config.truth.yaw_offset_rad))
-    return match(result.trajectory, truth, config.truth.align, config.truth.max_gap_s, T_body_base)
+    return match(result.trajectory, truth, config.truth.align, config.truth.max_gap_s, config.truth.offset_m)
 
 
 def _rms(values: FloatArray) -> float:

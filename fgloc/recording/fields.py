@@ -30,6 +30,7 @@ _MOST_LOOKED_AT = 5000  # messages
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _MOST_WAITING = 2000  # readings of a topic that wait for those of the others
 _AGAIN_NS = 1_000_000_000  # a message received so much before the last one: the recording is read again
+_ENOUGH = 20  # messages without an event, to be told
 _DEEPEST = 8  # messages inside messages
 
 
@@ -73,6 +74,12 @@ class NumericField:
     path: str
     low: float
     high: float
+
+    @property
+    def is_of_wheels(self) -> bool:
+        """Whether its name or its topic's says that it is an angle, a rate or a counter of wheels."""
+        name = f"{self.topic} {self.path}"
+        return bool(_RATE.search(name) or _ANGLE.search(name) or "wheel" in name.lower())
 
     @property
     def is_rate(self) -> bool:
@@ -122,6 +129,14 @@ class JointFields:
         self._columns = {topic: [k for k, j in enumerate(joints.values()) if j.topic == topic] for topic in self.topics}
         self._forget()
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on a field that is not there, and on topics that no time is common to."""
+        if self._taken >= _ENOUGH and not self._made and len(self.topics) > 1:
+            apart = f"The stamps of {' and '.join(self.topics)} have no time in common, so that their joints make no "
+            return (*self._notes.values(), f"{apart}motion: set recording.received_stamps: [joints].")
+        return tuple(self._notes.values())
+
     def events(self, content: Any, when: When) -> list[Event]:
         """Events that a message completes.
 
@@ -136,6 +151,7 @@ class JointFields:
         if received_ns < self._received_ns - _AGAIN_NS:
             self._forget()
         self._received_ns = received_ns
+        self._taken += 1
         values = self._read(content, topic)
         if len(self.topics) == 1:
             return [self._event(values, when)]
@@ -150,6 +166,7 @@ class JointFields:
         if reached_ns == self._made_ns or any(value is None for value in found.values()):
             return []
         self._made_ns = reached_ns
+        self._made += 1
         whole = np.full((2, len(self._names)), math.nan)
         for name, at in found.items():
             whole[:, self._columns[name]] = at[:, self._columns[name]]  # type: ignore[index]
@@ -157,6 +174,8 @@ class JointFields:
 
     def _forget(self) -> None:
         self._received_ns = self._made_ns = -1
+        self._taken = self._made = 0
+        self._notes: dict[str, str] = {}
         self._waiting: dict[str, deque[tuple[int, FloatArray]]] = {
             topic: deque(maxlen=_MOST_WAITING) for topic in self.topics
         }
@@ -168,15 +187,26 @@ class JointFields:
         for k in self._columns[topic]:
             joint = self._joints[self._names[k]]
             if joint.position is not None:
-                told = value_at(content, joint.position)
+                told = self._value(content, k, joint.position)
                 if joint.rolls_over is not None and math.isfinite(told):
                     told = self._unrolled(self._names[k], told, joint.rolls_over)
                 values[0, k] = joint.scale * told + joint.offset
             if joint.velocity is not None:
-                values[1, k] = joint.scale * value_at(content, joint.velocity)
+                values[1, k] = joint.scale * self._value(content, k, joint.velocity)
                 if joint.position is None:
                     values[1, k] += joint.offset
         return values
+
+    def _value(self, content: Any, k: int, path: str) -> float:
+        try:
+            return value_at(content, path)
+        except IndexError:
+            name = self._names[k]
+            self._notes[name] = (
+                f"recording.joints.{name}: {path} is beyond the end of the array in messages of "
+                f"{self._joints[name].topic}; they are not used."
+            )
+            raise
 
     def _unrolled(self, name: str, told: float, after: float) -> float:
         last, whole = self._counts.get(name, (told, told))

@@ -68,7 +68,12 @@ class MessageEvents:
     def __init__(self, config: RecordingConfig) -> None:
         """Take topics and clocks."""
         self._config = config
-        self._fields = JointFields(config.joints)
+        self._fields = JointFields(config.joints if config.topics.of_joints else {})
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on joints that the messages do not tell as they are configured."""
+        return self._fields.notes
 
     def of(self, content: Any, message_type: str, role: Role | None, received_ns: int, topic: str) -> list[Event]:
         """Events of one message in a role (None: none but that of tf), stamped as the configuration has it.
@@ -110,7 +115,7 @@ def _transform_truth(m: Any, when: When) -> Event:
 
 
 def _point_truth(m: Any, when: When) -> Event:
-    return TruthEvent(*when, m.header.frame_id, xyz(m.point), np.array([0.0, 0.0, 0.0, 1.0]))
+    return TruthEvent(*when, m.header.frame_id, xyz(m.point), np.array([0.0, 0.0, 0.0, 1.0]), has_yaw=False)
 
 
 def _planar_truth(m: Any, when: When) -> Event:
@@ -194,8 +199,9 @@ def select_roles(
     for role in sorted(names, key=_by_dependence):
         if config.given(role) is not None:
             continue
-        fitting = [topic for topic in filled if _fits(role, topic) and topic.name not in roles.values()]
-        poses = [topic.name for topic in fitting if topic.message_type != _TRANSFORM]
+        taken = (*roles.values(), *config.of_joints)
+        fitting = [topic for topic in filled if _fits(role, topic) and topic.name not in taken]
+        poses = [topic.name for topic in fitting if topic.message_type not in (_TRANSFORM, POINT)]
         candidates = poses or [topic.name for topic in fitting]
         camera = role.rpartition("/")[0]
         near = roles.get(camera_role(camera, "image")) or roles.get(camera_role(camera, "sightings"))
@@ -248,6 +254,8 @@ def _given_roles(
             notes.append(f"{topic_key(role)}: {given} has no messages; the run goes on without it.")
         elif role == "joints" and given in config.of_joints:
             roles[role] = given
+        elif given in config.of_joints:
+            problems.append(f"{topic_key(role)}: {given} is given in recording.joints too; choose one of them")
         elif problem := _misfit(role, given, topics):
             problems.append(problem)
         elif given in roles.values():
@@ -442,8 +450,8 @@ class Recording:
         self.roles: Mapping[Role, str] = selection.roles
         self.problems = selection.problems
         self.role_of: Mapping[str, Role] = {
-            **dict.fromkeys(config.topics.of_joints, "joints"),
             **{topic: role for role, topic in selection.roles.items()},
+            **dict.fromkeys(config.topics.of_joints, "joints"),
         }
         self.topics = tuple(replace(topic, role=self.role_of.get(topic.name)) for topic in found.values())
         known_types = TF_TYPES.union(*map(converters_of, role_names()))
@@ -470,7 +478,7 @@ class Recording:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes for the user, one sentence each. Damage is noted when reading meets it."""
-        return (*self._storage.notes, *self._notes)
+        return (*self._storage.notes, *self._notes, *self._events.notes)
 
     @property
     def unreadable(self) -> tuple[str, ...]:
@@ -519,8 +527,9 @@ class Recording:
     def _lacking_fields(self) -> Iterator[str]:
         """Sentences on joints whose field the topic's messages do not have."""
         types = {topic.name: topic.message_type for topic in self.topics}
+        counts = {topic.name: topic.count for topic in self.topics}
         for name, joint in self.config.joints.items():
-            if joint.topic not in types:
+            if not counts.get(joint.topic) or joint.topic not in self.config.topics.of_joints:
                 continue
             there = [*numeric_fields(types[joint.topic], self._decoder.store.fielddefs)]
             plain = {re.sub(r"\[\d+\]", "[0]", field) for field in there}

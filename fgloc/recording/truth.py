@@ -13,18 +13,20 @@ from fgloc.frames import quaternion_matrix, quaternion_yaw, roll_pitch, rpy_matr
 from fgloc.recording.reader import Recording
 from fgloc.types import FloatArray, IntArray, Trajectory, TruthEvent
 
-_MOVED_M = 0.1  # no jitter at rest reaches it
+_LEG_M, _COURSE_RAD = 0.2, 0.5  # of a path that turns; no jitter at rest reaches the first
 SLIPPING_TOPIC = "/truth/slipping"
 """Whether a wheel slips, in recordings of the simulator (std_msgs/Bool, stamped by its receipt)."""
 
 
 def base_pose(event: TruthEvent, config: TruthConfig) -> FloatArray:
-    """Planar pose ``(3,)`` of the base, from that of the body which the system tracks."""
+    """Planar pose ``(3,)`` of the base, from that of the body which the system tracks; the body's if it has no yaw."""
     T_body_base = se2.inverse((*config.offset_m, config.yaw_offset_rad))
     x, y = config.scale * event.position[0], config.scale * event.position[1]
     yaw = quaternion_yaw(event.orientation)
     if config.axes == "ned":
         x, y, yaw = y, x, se2.wrap(0.5 * math.pi - yaw)
+    if not event.has_yaw:
+        return np.array([x, y, 0.0])
     return se2.compose((x, y, yaw), T_body_base)
 
 
@@ -37,8 +39,16 @@ def base_ground(event: TruthEvent, config: TruthConfig) -> FloatArray:
 
 
 def lacks_yaw(poses: FloatArray) -> bool:
-    """Whether poses ``(n, 3)`` are of positions alone: they move, and their yaw never changes by a bit."""
-    return len(poses) > 1 and not np.ptp(poses[:, 2]) > 0.0 and float(np.ptp(poses[:, :2], axis=0).max()) > _MOVED_M
+    """Whether poses ``(n, 3)`` are of positions alone: their course turns, and their yaw never changes by a bit."""
+    if len(poses) < 3 or np.ptp(poses[:, 2]) > 0.0:
+        return False
+    corners, anchor = [poses[0, :2]], poses[0, :2]
+    for place in poses[:, :2]:
+        if math.hypot(*(place - anchor)) > _LEG_M:
+            corners.append(place)
+            anchor = place
+    legs = np.diff(np.array(corners), axis=0)
+    return len(legs) > 1 and float(np.ptp(np.unwrap(np.arctan2(legs[:, 1], legs[:, 0])))) > _COURSE_RAD
 
 
 def true_slips(recording: Recording) -> IntArray:
@@ -68,6 +78,7 @@ class TruthTrack:
         self._set_back_ns = 0
         self._stamps = array("q")
         self._poses = array("d")
+        self._has_yaw = True
 
     def add(self, event: TruthEvent) -> None:
         """Add one pose."""
@@ -80,6 +91,7 @@ class TruthTrack:
         else:
             self._set_back_ns = stamp
         self._stamps.append(stamp)
+        self._has_yaw &= event.has_yaw
         self._poses.extend(base_pose(event, self._config).tolist())
         self._poses.extend(base_ground(event, self._config).tolist())
 
@@ -88,7 +100,14 @@ class TruthTrack:
         stamps, poses = self._arrays()
         stamps, last = np.unique(stamps[::-1], return_index=True)
         whole = poses[::-1][last]
-        return None if len(stamps) < 2 else Trajectory(stamps, whole[:, :3].copy(), ground=whole[:, 3:].copy())
+        if len(stamps) < 2:
+            return None
+        planar, ground = whole[:, :3].copy(), whole[:, 3:].copy()
+        if self._has_yaw and lacks_yaw(planar):
+            T_body_base = se2.inverse((*self._config.offset_m, self._config.yaw_offset_rad))
+            planar[:, :2] -= se2.compose((0.0, 0.0, planar[0, 2] - T_body_base[2]), T_body_base)[:2]
+            self._has_yaw = False
+        return Trajectory(stamps, planar, ground=ground if self._has_yaw else None, has_yaw=self._has_yaw)
 
     def _forget_after(self, stamp_ns: int) -> None:
         stamps, poses = self._arrays()

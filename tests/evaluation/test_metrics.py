@@ -244,7 +244,7 @@ def test_a_truth_without_a_yaw_is_no_body_that_is_turned(truth: str, named: bool
     true = {"of its own": yaw, "turned": yaw - 0.5, "none": np.zeros(len(t))}[truth]
     stamps = np.round(1e9 * t).astype(np.int64)
     estimate = Trajectory(stamps, np.column_stack([path, yaw]))
-    matched = match(estimate, Trajectory(stamps, np.column_stack([path + 0.01, true])))
+    matched = match(estimate, Trajectory(stamps, np.column_stack([path + 0.01, true]), has_yaw=bool(true.any())))
     finding = metrics._turned(Config(), matched)
     assert (finding is not None) is named
     if finding is not None:

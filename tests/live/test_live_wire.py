@@ -264,11 +264,16 @@ def told(event):
     return (type(event).__name__, *(v.tobytes() if isinstance(v, np.ndarray) else repr(v) for v in values))
 
 
-def played(path, config, rate):
-    """Events that arrive when a recording is played, and the player."""
-    events = []
+def played(path, config, rate, publishers=None):
+    """Events that arrive when a recording is played, and the player; ``publishers`` gets the names of theirs."""
+    events, names = [], set() if publishers is None else publishers
+
+    def push(event, publisher):
+        events.append(event)
+        names.add(publisher)
+
     with Participant(DOMAIN) as one, Participant(DOMAIN) as other, Player(path, one) as player:
-        topics = Intake(other, WireClock(other), config, lambda event, _: events.append(event))
+        topics = Intake(other, WireClock(other), config, push)
 
         def follow():
             while not ended.wait(0.05):
@@ -317,11 +322,22 @@ def test_joints_of_two_topics_arrive_as_they_are(tmp_path):
     topics = {"image": "none", "sightings": "none"}
     config = RecordingConfig.model_validate({"joints": SIDES, "topics": topics})
     path = two_topics(tmp_path / "run", 5.0)
-    events, _ = played(path, config, rate=5.0)
+    publishers = set()
+    events, _ = played(path, config, 5.0, publishers)
+    assert len(publishers) == 1  # of two writers: a run would leave one of two out
     with open_recording(path, config) as recording:
         expected = [told(event) for event in recording.events()]
     assert len(expected) > 190
     assert [*map(told, events)] == expected
+
+
+def test_joints_of_one_topic_arrive_once(tmp_path):
+    joints = {"left": SIDES["left"]}
+    config = RecordingConfig.model_validate({"joints": joints, "topics": {"image": "none", "sightings": "none"}})
+    path = two_topics(tmp_path / "run", 3.0)
+    events, _ = played(path, config, rate=5.0)
+    with open_recording(path, config) as recording:
+        assert [*map(told, events)] == [told(event) for event in recording.events()]
 
 
 def test_timing_is_the_recorded_one(tmp_path):

@@ -162,6 +162,60 @@ def test_what_cannot_be_is_refused_by_its_key(tmp_path, recording, facts):
         load_config(tmp_path / "robot.yaml")
 
 
+def test_no_topic_has_another_role_too(tmp_path):
+    twist = "geometry_msgs/msg/TwistStamped"
+    messages = []
+    for k in range(100):
+        at_ns = START_NS + k * 50_000_000
+        header = {"stamp": {"sec": at_ns // 10**9, "nanosec": at_ns % 10**9}}
+        for side, rate in (("left", 2.0), ("right", 3.0)):
+            values = {"header": header, "twist": {"linear": {"x": rate}}}
+            messages.append((f"/{side}_wheel", twist, at_ns + 1_000_000, values))
+    joints = {s: {"topic": f"/{s}_wheel", "velocity": "twist.linear.x"} for s in ("left", "right")}
+    path = write_messages(tmp_path / "bag", messages)
+    late = RecordingConfig.model_validate({"joints": joints, "stamp_offset_s": {"joints": 0.5}})
+    with open_recording(path, late) as recording:
+        events = [*recording.events()]
+        assert dict(recording.roles) == {"joints": "/left_wheel"}
+    assert len(events) == 100
+    assert events[0].stamp_ns == START_NS + 500_000_000
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(sections(joints, wheels=WHEELS)))
+    code, _, _ = fgloc("info", path, "--config", tmp_path / "robot.yaml")
+    assert code == 0
+    both = {"joints": joints, "topics": {"command": "/right_wheel"}}
+    with refusal(RecordingError, "recording.topics.command", "/right_wheel", "recording.joints"):
+        open_recording(path, RecordingConfig.model_validate(both))
+
+
+def test_joints_are_switched_off_as_any_role(tmp_path):
+    off = RecordingConfig.model_validate({"joints": SIDES, "topics": {"joints": "none"}})
+    with open_recording(two_topics(tmp_path / "bag", 2.0), off) as recording:
+        assert not [*recording.events()]
+        assert "joints" not in recording.roles
+
+
+def test_stamps_without_a_common_time_and_an_array_that_is_too_short_are_told(tmp_path):
+    header = {"stamp": {"sec": 5, "nanosec": 0}}
+    messages = [
+        *(("/left", COUNTS, START_NS + k * 50_000_000, {"data": k}) for k in range(50)),
+        *(("/right", POINT, START_NS + k * 50_000_000, {"header": header, "point": {"x": 1.0 * k}}) for k in range(50)),
+    ]
+    sides = {"left": {"topic": "/left", "position": "data"}, "right": {"topic": "/right", "position": "point.x"}}
+    path = write_messages(tmp_path / "apart", messages)
+    with open_recording(path, RecordingConfig.model_validate({"joints": sides})) as recording:
+        assert not [*recording.events()]
+        assert any("recording.received_stamps" in note and "/right" in note for note in recording.notes)
+    received = RecordingConfig.model_validate({"joints": sides, "received_stamps": ["joints"]})
+    with open_recording(path, received) as recording:
+        assert len([*recording.events()]) == 50
+    short = [("/wheels", ARRAY, START_NS + k * 50_000_000, {"data": [0.1 * k]}) for k in range(30)]
+    joints = {"l": {"topic": "/wheels", "position": "data[0]"}, "r": {"topic": "/wheels", "position": "data[1]"}}
+    path = write_messages(tmp_path / "short", short)
+    with open_recording(path, RecordingConfig.model_validate({"joints": joints})) as recording:
+        assert not [*recording.events()]
+        assert any("recording.joints.r" in note and "data[1]" in note for note in recording.notes)
+
+
 def test_init_lists_the_numbers_that_may_be_of_wheels(tmp_path):
     bag = two_topics(tmp_path / "bag")
     code, _, _ = fgloc("init", bag, "--out", tmp_path / "robot.yaml")

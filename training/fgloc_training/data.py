@@ -333,7 +333,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
     for kind, count in (("commands", sum(isinstance(e, ControlEvent) for e in sensed)), ("truth", len(stamps))):
         if count < 2:
             raise RecordingError(f"{path}: {count} messages of {kind}; identification needs commands and truth")
-    if lacks_yaw(rows):
+    if truth_from is None and (lacks_yaw(rows) or not all(event.has_yaw for event in truth)):
         raise RecordingError(
             f"{path}: the truth has positions and no yaw, which identification needs; smooth the recording and give "
             "its folder as the truth of the training"

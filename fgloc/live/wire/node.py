@@ -99,8 +99,9 @@ class Intake:
             if is_new and self._transport.has_volatile(topic):
                 self._also.add(topic)
                 self._transport.read(topic, types[topic], self._on_message)
-        wanted = [*self.roles.items(), *(("joints", topic) for topic in self._config.topics.of_joints if self.roles)]
-        new = [(role, topic) for role, topic in wanted if topic not in self._role_of and topic in types]
+        wanted: dict[str, Role] = {topic: role for role, topic in self.roles.items()}
+        wanted |= dict.fromkeys(self._config.topics.of_joints if self.roles else (), "joints")
+        new = [(role, topic) for topic, role in wanted.items() if topic not in self._role_of and topic in types]
         new = [(role, topic) for role, topic in new if self.truth or role != "truth"]
         for role, topic in new:
             self._role_of[topic] = role
@@ -125,6 +126,7 @@ class Intake:
             given = self._config.topics.given(role)
             if given not in (None, "none") and given not in names:
                 lacking.append(f"{given} ({topic_key(role)})")
+        lacking += [f"{topic} (recording.joints)" for topic in self._config.topics.of_joints[1:] if topic not in names]
         there = ", ".join(f"{p.topic} ({p.message_type})" for p in self._found) or "none"
         return f"Waiting for {' and '.join(lacking)}; topics there: {there}." if lacking else ""
 
@@ -140,8 +142,9 @@ class Intake:
             with self._counting:
                 self.undecodable[topic] += 1
             return
+        several = topic in self._config.topics.of_joints  # an event of several topics is of several publishers
         for event in events:
-            self._push(event, message.publisher)
+            self._push(event, "" if several else message.publisher)
 
 
 # --- What the user is told: each thing once ---------------------------------------------------------------------------
