@@ -304,11 +304,10 @@ _MOST_NUMBERS = 12  # lines
 
 
 def _numbers(bag: Path, taken: Collection[str]) -> tuple[NumericField, ...]:
-    """Numbers in messages of no other role, those first whose names are of wheels."""
+    """Numbers on topics without a role, those first whose names are of wheels."""
     known = TF_TYPES.union(*map(converters_of, role_names())) - {POINT}
     with closing(Storage(bag)) as storage:
-        found = [number for number in unread_numbers(storage, known) if number.topic not in taken]
-    return tuple(sorted(found, key=lambda number: not number.is_of_wheels))
+        return tuple(sorted(unread_numbers(storage, known, taken), key=lambda number: not number.is_of_wheels))
 
 
 _MOST_OPTIONAL = 500  # messages of such a topic

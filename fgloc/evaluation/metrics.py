@@ -94,7 +94,7 @@ def match(
 
     Args:
         estimate: poses of the base.
-        truth: poses of the base, too.
+        truth: poses of the base, too; without a yaw positions of a point on the robot.
         align: how the truth is moved into the estimate's frame.
         max_gap_s: see above.
         offset_m: that point in the base frame, of a truth without a yaw.

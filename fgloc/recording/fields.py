@@ -88,14 +88,15 @@ class NumericField:
         return bool(_RATE.search(name)) and not _ANGLE.search(name)
 
 
-def unread_numbers(storage: Storage, known: Collection[str]) -> Iterator[NumericField]:
+def unread_numbers(storage: Storage, known: Collection[str], taken: Collection[str]) -> Iterator[NumericField]:
     """Numbers in the messages of types that nothing reads: they may be the angles or rates of wheels.
 
     Args:
         storage: of the recording.
         known: types that something reads.
+        taken: topics that play a role.
     """
-    channels = [c for c in storage.channels if c.count and c.message_type not in known]
+    channels = [c for c in storage.channels if c.count and c.message_type not in known and c.topic not in taken]
     decoder = Decoder(storage.kind == "ros1", [(c.message_type, c.definition) for c in channels])
     for channel in channels:
         paths = [*numeric_fields(channel.message_type, decoder.store.fielddefs)]
@@ -114,7 +115,7 @@ def unread_numbers(storage: Storage, known: Collection[str]) -> Iterator[Numeric
 
 
 class JointFields:
-    """Makes joint states of the fields that `recording.joints` names.
+    """Maker of joint states from the fields that `recording.joints` names.
 
     Joints of one topic make an event for each message. Those of several make one for each time that all topics have
     reached: the readings before and after it are interpolated.

@@ -106,7 +106,7 @@ class TruthTrack:
         if self._has_yaw and lacks_yaw(planar):
             T_body_base = se2.inverse((*self._config.offset_m, self._config.yaw_offset_rad))
             planar[:, :2] -= se2.compose((0.0, 0.0, planar[0, 2] - T_body_base[2]), T_body_base)[:2]
-            self._has_yaw = False
+            return Trajectory(stamps, planar, has_yaw=False)
         return Trajectory(stamps, planar, ground=ground if self._has_yaw else None, has_yaw=self._has_yaw)
 
     def _forget_after(self, stamp_ns: int) -> None:

@@ -14,7 +14,8 @@ from fgloc.config import Config
 from fgloc.errors import EstimatorError, RecordingError
 from fgloc.evaluation.metrics import compared, compute_metrics, in_own_gauge, match, match_result, nees
 from fgloc.evaluation.report import write_results
-from fgloc.types import Trajectory
+from fgloc.recording.truth import TruthTrack
+from fgloc.types import Trajectory, TruthEvent
 from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
@@ -106,6 +107,18 @@ def test_without_alignment_the_error_is_in_the_maps_frame(bag):
     metrics = compute_metrics(run(bag, None, config, "online"), config)
     assert metrics.ate_rmse_m < 0.01
     assert metrics.yaw_mae_deg is None
+
+
+def test_poses_whose_yaw_never_changes_are_positions_however_often_they_are_asked_for():
+    config = settings().truth
+    track = TruthTrack(config, 1.0)
+    places = np.array([se2.compose(circle(k), (*LEVER, 0.0))[:2] for k in range(100)])
+    for k, (x, y) in enumerate(places.tolist()):
+        track.add(TruthEvent(k, k, "/truth", "map", np.array([x, y, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])))
+    for _ in range(2):
+        truth = track.trajectory()
+        assert not truth.has_yaw
+        np.testing.assert_allclose(truth.poses[:, :2], places, atol=1e-12)
 
 
 def test_points_are_no_truth_unless_their_topic_says_so(tmp_path):
