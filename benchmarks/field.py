@@ -49,6 +49,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from benchmarks.common import DATA, Row, main, not_run
 from benchmarks.field_peers import Heard, hear, textbook
@@ -150,21 +151,34 @@ def outcome(recording: Recording) -> Outcome:
     return out
 
 
-def ran_through(recording: Recording, bag: Path, folder: Path) -> Mapping[str, Any]:
-    """Exit code, output, time, poses and metrics of each command line, kept by the hash of the sources."""
-    return kept(f"field_{recording.name}", lambda: _commands(recording, bag, folder))
+def ran_through(recording: Recording, bag: Path, folder: Path, begun: FloatArray | None = None) -> Mapping[str, Any]:
+    """Exit code, output, time, poses and metrics of each command line, kept by the hash of the sources.
+
+    Args:
+        recording: what the bag holds.
+        bag: where it is.
+        folder: of the results.
+        begun: first pose ``(3,)`` to give besides; None: what ``init`` writes alone.
+    """
+    name = recording.name if begun is None else f"{recording.name}_begun"
+    return kept(f"field_{name}", lambda: _commands(recording, bag, folder, begun))
 
 
-def _commands(recording: Recording, bag: Path, folder: Path) -> dict[str, Any]:
-    config, found_map = folder / "init" / "robot.yaml", recording.map_path(folder)
-    config.parent.mkdir()
+def _commands(recording: Recording, bag: Path, folder: Path, begun: FloatArray | None) -> dict[str, Any]:
+    results_in = folder if begun is None else folder / "begun"
+    config, found_map = results_in / "init" / "robot.yaml", recording.map_path(folder)
+    config.parent.mkdir(parents=True)
     given = [str(bag), "--config", str(config), *([] if found_map is None else ["--map", str(found_map)])]
     results = {"init": _command(["init", str(bag), "--out", str(config)])}
+    if begun is not None:
+        settings = yaml.safe_load(config.read_text(encoding="utf-8"))
+        settings["estimator"] = (settings.get("estimator") or {}) | {"initial_pose": begun.tolist()}
+        config.write_text(yaml.safe_dump(settings), encoding="utf-8")
     if not config.is_file():
         given = [part for part in given if part not in ("--config", str(config))]
     results["info"] = _command(["info", *given])
     for mode, name in (("batch", "smooth"), ("online", "online")):
-        out = folder / mode
+        out = results_in / mode
         results[mode] = _command([name, *given, "--out", str(out)])
         if (out / "metrics.json").is_file():
             results[mode]["metrics"] = json.loads((out / "metrics.json").read_text(encoding="utf-8"))

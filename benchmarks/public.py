@@ -11,12 +11,14 @@ fgloc with what it wrote, and the same messages through other programs. ATE is t
 - Others take part by their poses. ``--export DIR`` writes each recording as a bag with its ``map.yaml`` and ends;
   ``--poses NAME=DIR`` reads ``DIR/RECORDING.tum`` into the same table. In a map's frame they are compared as they are.
 
-On a map the baselines start at the truth's first pose, which no user has: fgloc finds its own. ``--tune`` searches the
-constants and prints them. The simulator's recordings have a bench of their own (`benchmarks.peers`).
+On a map the baselines start at the truth's first pose: fgloc finds its own. ``fgloc_begun`` is given that pose, too
+(`estimator.initial_pose`). ``--tune`` searches the constants and prints them. The simulator's recordings have a bench of their own (`benchmarks.peers`).
 
 - ``public.NAME.PROGRAM.{batch,online}.ate_m``
 - ``public.NAME.{batch,online}.best_over_fgloc``: least ATE of the others over fgloc's; below 1 fgloc loses.
-- ``public.{batch,online}.median_over_fgloc``, ``public.losses``: of all sets, and how many ratios are below 1.
+  ``.best_over_fgloc_begun``: on a map, all begun alike.
+- ``public.{batch,online}.median_over_fgloc``, ``public.losses``: of all sets, and how many ratios are below 1;
+  ``.median_over_fgloc_begun``, ``.losses_begun``: begun alike where there is a map.
 """
 
 # ruff: noqa: E501 (lines of the page)
@@ -78,10 +80,16 @@ def compared(recording: Recording, poses: Mapping[str, Path]) -> dict[str, float
         bag = recording.bag(folder)
         ran = ran_through(recording, bag, folder)
         heard, landmarks = hear(bag, recording.truth), landmarks_of(recording, folder)
+        begun = None
+        if landmarks and heard.odometry is not None and heard.truth is not None:
+            first = heard.truth.interpolate(int(heard.odometry.stamps_ns[0]))
+            begun = ran_through(recording, bag, folder, first)
     estimates = others(heard, landmarks)
-    for mode in MODES:
-        if len(ran[mode].get("poses", ())) > 1:
-            estimates[f"fgloc.{mode}"] = Trajectory(np.array(ran[mode]["stamps"]), np.array(ran[mode]["poses"]))
+    for name, results in (("fgloc", ran), ("fgloc_begun", begun)):
+        for mode in MODES:
+            if results is not None and len(results[mode].get("poses", ())) > 1:
+                poses_of = Trajectory(np.array(results[mode]["stamps"]), np.array(results[mode]["poses"]))
+                estimates[f"{name}.{mode}"] = poses_of
     for program, tums in poses.items():
         if (path := tums / f"{recording.name}.tum").is_file():
             estimates |= dict.fromkeys((f"{program}.batch", f"{program}.online"), read_tum(path))
@@ -133,34 +141,38 @@ def measure(quick: bool, only: Sequence[str], poses: Mapping[str, Path], page: P
     for recording in chosen:
         found[recording.name] = compared(recording, poses)
         print(f"  {recording.name}: {found[recording.name]}", file=sys.stderr, flush=True)
-    ratios: dict[Mode, list[float]] = {mode: [] for mode in MODES}
-    for recording in chosen:
-        ate = found[recording.name]
-        for name, value in ate.items():
+        for name, value in found[recording.name].items():
             yield Row(f"public.{recording.name}.{name}.ate_m", value, unit="m")
-        for mode in MODES:
-            best = best_of(ate, mode)
-            if best is None or f"fgloc.{mode}" not in ate:
-                yield from not_run(
-                    [f"public.{recording.name}.{mode}.best_over_fgloc"], "no poses of fgloc, or of others"
-                )
-                continue
-            ratios[mode].append(ate[best] / ate[f"fgloc.{mode}"])
-            yield Row(f"public.{recording.name}.{mode}.best_over_fgloc", ratios[mode][-1], unit=best)
-    for mode, values in ratios.items():
-        if values:
-            yield Row(
-                f"public.{mode}.median_over_fgloc", float(np.median(values)), float(np.std(np.log(values))), len(values)
-            )
-    every = [value for values in ratios.values() for value in values]
-    yield Row("public.losses", float(sum(value < 1.0 for value in every)), n=len(every))
+    for program, suffix in (("fgloc", ""), ("fgloc_begun", "_begun")):
+        yield from _ratios(found, program, suffix)
     if page is not None:
         write_page(page, chosen, found)
 
 
+def _ratios(found: Mapping[str, Mapping[str, float]], program: str, suffix: str) -> Iterator[Row]:
+    """Rows of the least ATE of others over that of a program of fgloc's, which is `fgloc` where it has none."""
+    ratios: dict[Mode, list[float]] = {mode: [] for mode in MODES}
+    for name, ate in found.items():
+        for mode in MODES:
+            best, own = best_of(ate, mode), ate.get(f"{program}.{mode}", ate.get(f"fgloc.{mode}"))
+            if best is None or own is None:
+                key = f"public.{name}.{mode}.best_over_fgloc{suffix}"
+                yield from not_run([key], "no poses of fgloc, or of others")
+                continue
+            ratios[mode].append(ate[best] / own)
+            if f"{program}.{mode}" in ate:
+                yield Row(f"public.{name}.{mode}.best_over_fgloc{suffix}", ratios[mode][-1], unit=best)
+    for mode, values in ratios.items():
+        if values:
+            spread = float(np.std(np.log(values)))
+            yield Row(f"public.{mode}.median_over_fgloc{suffix}", float(np.median(values)), spread, len(values))
+    every = [value for values in ratios.values() for value in values]
+    yield Row(f"public.losses{suffix}", float(sum(value < 1.0 for value in every)), n=len(every))
+
+
 def best_of(ate: Mapping[str, float], mode: Mode) -> str | None:
     """Program and mode of the least ATE other than fgloc's; None: there is none."""
-    rivals = [name for name in ate if name.endswith(f".{mode}") and not name.startswith("fgloc.")]
+    rivals = [name for name in ate if name.endswith(f".{mode}") and not name.startswith("fgloc")]
     return min(rivals, key=lambda name: ate[name], default=None)
 
 
@@ -170,17 +182,18 @@ _HEAD = """# Public bench
 
 Recordings that others made, with truth and landmarks: ATE [m] of fgloc with defaults after `fgloc init`, and of other programs on the same messages, losses first.
 Programs, their constants and the error are described in `benchmarks/public.py`. On a map the others start at the truth's first pose; fgloc has to find its own. Constants of
-`isam2` are the best on the recordings marked *dev*, those of `untuned` were never chosen. Another program takes part by its poses (`--export`, `--poses`).
+`isam2` are the best on the recordings marked *dev*, those of `untuned` were never chosen. `fgloc_begun` starts at the truth's first pose as they do. Another program takes
+part by its poses (`--export`, `--poses`).
 
-| recording | {programs} | best other / fgloc: batch | online |
-|---|{dashes}---|---|
+| recording | {programs} | best other / fgloc: batch | online | / fgloc_begun: batch | online |
+|---|{dashes}---|---|---|---|
 """
 
 
 def write_page(path: Path, chosen: Sequence[Recording], found: Mapping[str, Mapping[str, float]]) -> None:
     """Write the table as Markdown, the least ratio first. A program whose modes are alike has one column."""
     programs = list(dict.fromkeys(name.rsplit(".", 1)[0] for ate in found.values() for name in ate))
-    programs.sort(key=lambda name: name != "fgloc")
+    programs.sort(key=lambda name: not name.startswith("fgloc"))
     columns = [(name, mode) for name in programs for mode in MODES]
     for name in programs:
         if all(ate.get(f"{name}.{MODES[0]}") == ate.get(f"{name}.{MODES[1]}") for ate in found.values()):
@@ -188,14 +201,17 @@ def write_page(path: Path, chosen: Sequence[Recording], found: Mapping[str, Mapp
     rows = []
     for recording in chosen:
         ate = found[recording.name]
-        ratios = []
-        for mode in MODES:
-            best, own = best_of(ate, mode), ate.get(f"fgloc.{mode}", math.nan)
-            ratios.append(math.nan if best is None else ate[best] / own)
+        own = [(program, mode) for program in ("fgloc", "fgloc_begun") for mode in MODES]
+        best = {mode: best_of(ate, mode) for mode in MODES}
+        ratios = [
+            math.nan if best[mode] is None else ate[str(best[mode])] / ate.get(f"{program}.{mode}", math.nan)
+            for program, mode in own
+        ]
         cells = [f"{ate[key]:.3f}" if (key := f"{name}.{mode}") in ate else "–" for name, mode in columns]
-        cells += ["no poses" if math.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios]
+        cells += ["no poses" if math.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios[:2]]
+        cells += ["–" if math.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios[2:]]
         name = f"{recording.name} *dev*" if recording.development else recording.name
-        least = -math.inf if any(map(math.isnan, ratios)) else min(ratios)
+        least = -math.inf if any(map(math.isnan, ratios[:2])) else min(ratios[:2])
         rows.append((least, f"| {name} | {' | '.join(cells)} |"))
     rows.sort(key=lambda row: row[0])
     heads = [f"{name} {mode}" if (name, MODES[1]) in columns else name for name, mode in columns]

@@ -80,7 +80,7 @@ class Path:
 
     def known(self, first: FloatArray, last: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """Whether the motion between two times is known."""
-        inside = (first >= self.times[0]) & (last <= self.times[-1])
+        inside = (np.minimum(first, last) >= self.times[0]) & (np.maximum(first, last) <= self.times[-1])
         a = self.gaps[np.clip(np.searchsorted(self.times, first), 0, len(self.times) - 1)]
         b = self.gaps[np.clip(np.searchsorted(self.times, last), 0, len(self.times) - 1)]
         return np.asarray(inside & (a == b))

@@ -81,6 +81,14 @@ def test_a_first_pose_that_the_first_sightings_contradict_is_named_and_not_used(
     assert found.config.estimator.initial_pose == (None if is_named else given)
 
 
+def test_sightings_before_the_first_message_of_the_wheels_do_not_contradict_a_first_pose():
+    known = LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in places().items()})
+    found = Conventions(config_of({"estimator": {"initial_pose": (0.0, 0.0, 0.0)}}), Signals(), landmark_map=known)
+    seen = seen_from()
+    check_first_pose(found, path_of(), replace(seen, times=seen.times - 0.2))
+    assert not found.codes
+
+
 def test_a_map_tells_ranges_from_depths_where_the_way_of_a_robot_hardly_does():
     still = np.zeros(len(T))
     ahead = np.cumsum(0.02 * (0.05 + 0.03 * np.sin(0.9 * T))), still, still
