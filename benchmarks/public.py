@@ -82,7 +82,7 @@ def compared(recording: Recording, poses: Mapping[str, Path]) -> dict[str, float
         heard, landmarks = hear(bag, recording.truth), landmarks_of(recording, folder)
         begun = None
         if landmarks and heard.odometry is not None and heard.truth is not None:
-            first = heard.truth.interpolate(int(heard.odometry.stamps_ns[0]))
+            first = heard.truth.interpolate(int(max(heard.odometry.stamps_ns[0], heard.truth.stamps_ns[0])))
             begun = ran_through(recording, bag, folder, first)
     estimates = others(heard, landmarks)
     for name, results in (("fgloc", ran), ("fgloc_begun", begun)):
