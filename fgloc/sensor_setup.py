@@ -309,7 +309,8 @@ TELLING_MOTION = _WHEELS | {"imu", "image", "sightings"}
 
 CONVERT = (
     "Wheels whose angles or rates come in messages of another type: name the fields in recording.joints "
-    "(docs/drives.md); velocity and yaw rate have to be converted to nav_msgs/Odometry."
+    "(docs/drives.md). Poses or velocities of an odometry (PoseStamped, TwistStamped, also with covariance): name the "
+    "topic in recording.topics.odometry."
 )
 
 

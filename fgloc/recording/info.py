@@ -16,7 +16,7 @@ from fgloc.config import BUILT_IN_ROLES, Config, Role, base_role, base_roles
 from fgloc.errors import RecordingError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.reader import HEADERLESS, TF_TYPES, Recording, TopicInfo
+from fgloc.recording.reader import HEADERLESS, TF_TYPES, Recording, TopicInfo, converters_of
 from fgloc.sensors import registry
 from fgloc.sensors.checks import (
     Collector,
@@ -386,7 +386,7 @@ def _roles(
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
         told = "sightings alone tell" if {"image", "sightings"} & base_roles(roles) else "nothing measures"
         text = f"No odometry, joint states or commands: {told} how the robot moves."
-        yield Finding(motion, text, Severity.WARNING)
+        yield Finding(motion, text + _perhaps_odometry(recording), Severity.WARNING)
     if not unsettled and not placing_roles(roles, config):
         yield Finding(place, "No images and no marker sightings: nothing bounds the drift.", Severity.WARNING)
     images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
@@ -406,6 +406,18 @@ def _roles(
         if frames:
             bases, frame = _base_names(config, child_frame), next(filter(None, frames), "")
             yield from note(unmounted, _mounting(recording, bases, frame, needs_camera), Severity.WARNING)
+
+
+def _perhaps_odometry(recording: Recording) -> str:
+    """Sentence on topics that are read as odometry only where the configuration names them; empty: there are none."""
+    fitting = [
+        topic.name
+        for topic in recording.topics
+        if topic.role is None and topic.count and topic.message_type in converters_of("odometry")
+    ]
+    if not fitting:
+        return ""
+    return f" If {' or '.join(fitting)} is an odometry of the robot, set recording.topics.odometry: {fitting[0]}."
 
 
 def unread_map(recording: Recording, config: Config) -> str | None:

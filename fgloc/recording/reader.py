@@ -124,6 +124,7 @@ def _planar_truth(m: Any, when: When) -> Event:
     return TruthEvent(*when, "", np.array([m.x, m.y, 0.0]), orientation)
 
 
+_ODOMETRY, _TWIST = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistWithCovarianceStamped"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"  # as Vicon's bridge publishes poses
 POINT = "geometry_msgs/msg/PointStamped"  # a total station's, without a yaw; or a click on a map
 CONVERTERS: dict[Role, dict[str, Converter]] = {
@@ -133,7 +134,7 @@ CONVERTERS: dict[Role, dict[str, Converter]] = {
         "geometry_msgs/msg/PoseWithCovarianceStamped": _covariance_truth,
         "geometry_msgs/msg/Pose2D": _planar_truth,
         _TRANSFORM: _transform_truth,
-        "nav_msgs/msg/Odometry": _covariance_truth,
+        _ODOMETRY: _covariance_truth,
         POINT: _point_truth,
     },
 }
@@ -201,8 +202,8 @@ def select_roles(
             continue
         taken = (*roles.values(), *config.of_joints)
         fitting = [topic for topic in filled if _fits(role, topic) and topic.name not in taken]
-        poses = [topic.name for topic in fitting if topic.message_type not in (_TRANSFORM, POINT)]
-        candidates = poses or [topic.name for topic in fitting]
+        whole = [topic.name for topic in fitting if topic.message_type not in (_TRANSFORM, POINT, _TWIST)]
+        candidates = whole or [topic.name for topic in fitting]
         camera = role.rpartition("/")[0]
         near = roles.get(camera_role(camera, "image")) or roles.get(camera_role(camera, "sightings"))
         if role in config.of_cameras:  # a calibration that is not beside its images may be of any camera
@@ -288,7 +289,7 @@ def _unnamed(role: Role, filled: Iterable[TopicInfo]) -> str:
     """Note on topics that fit by type but not by name; empty if there are none, or names do not count for the role."""
     if role not in ("image", "truth"):
         return ""
-    fitting = converters_of(role).keys() - converters_of("odometry").keys()
+    fitting = converters_of(role).keys() - {_ODOMETRY}
     by_type = [t.name for t in filled if t.message_type in fitting and not t.name.startswith(OWN)]
     if not by_type:
         return ""
@@ -334,10 +335,10 @@ def _fits(role: Role, topic: TopicInfo) -> bool:
     if topic.message_type not in converters_of(role):
         return False
     if role == "truth":
-        other = topic.message_type in (_TRANSFORM, POINT) or topic.message_type in converters_of("odometry")
+        other = topic.message_type in (_TRANSFORM, POINT, _ODOMETRY)
         return _says_truth(topic.name) or not (other or _NOT_TRUTH.search(topic.name))
-    if role == "odometry":
-        return not _says_truth(topic.name)
+    if role == "odometry":  # other poses and twists may be anything: the configuration has to name them
+        return topic.message_type in (_ODOMETRY, _TWIST) and not _says_truth(topic.name)
     if role in ("image", "camera_info"):
         return not is_derived(topic.name)
     return True

@@ -1,4 +1,4 @@
-"""Odometries beside the wheels: visual, LiDAR, second wheels, any ``nav_msgs/Odometry`` (``recording.odometries``).
+"""Odometries beside the wheels: visual, LiDAR, second wheels, poses or twists (``recording.odometries``).
 
 Each is a motion source of its own, named ``odometry.NAME``. Its motion over a step is that of its poses, where it gives
 them, else of its twists; what it tracks is mounted at ``pose`` in the base frame. Mounting, scale and clock are
@@ -13,7 +13,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,9 +21,15 @@ from pydantic import Field
 from fgloc import se2
 from fgloc.config import ODOMETRIES, Config, GateConfig, NoiseDensity, OdometryTopic
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.sensors.base import BASE, BuiltIn, EventInput, FoundRow, MotionInstallation, Parameter, Rank, Stream, When
+from fgloc.sensors.base import BASE, BuiltIn, EventInput, FoundRow, MotionInstallation, Parameter, Rank, Stream
 from fgloc.sensors.failures import Change, EventFailure, Failure, Scene
-from fgloc.sensors.wheels.events import OdometryChecks, PoseAndTwistEvent, odometry_fields, odometry_validator
+from fgloc.sensors.wheels.events import (
+    NOT_GIVEN,
+    OdometryChecks,
+    PoseAndTwistEvent,
+    odometry_converters,
+    odometry_validator,
+)
 from fgloc.sensors.wheels.failures import JoinedWheels
 from fgloc.types import Event, FloatArray, IntArray, MotionMeasurement, Step
 
@@ -33,11 +39,6 @@ from fgloc.types import Event, FloatArray, IntArray, MotionMeasurement, Step
 @dataclass(frozen=True, slots=True, eq=False)
 class BesideEvent(PoseAndTwistEvent):
     """``nav_msgs/Odometry`` of a source beside the wheels; its topic tells which one."""
-
-
-def from_odometry(m: Any, when: When) -> Event:
-    """Event of a ``nav_msgs/Odometry``."""
-    return BesideEvent(*when, *odometry_fields(m))
 
 
 class OdometriesInput(EventInput):
@@ -63,11 +64,11 @@ class OdometriesInput(EventInput):
         unknown = (math.nan,) * 3
         x, y, yaw = unknown if pose is None else pose
         vx, vy, w = unknown if twist is None else twist
-        cov = np.zeros((6, 6))
-        if twist_cov is not None:
+        cov = np.zeros((6, 6)) if twist is not None else NOT_GIVEN
+        if twist_cov is not None and twist is not None:
             cov[np.ix_(_ROS, _ROS)] = twist_cov
         orientation = np.full(4, np.nan) if math.isnan(yaw) else yaw_quaternion(float(yaw))
-        moved = np.array([x, y, 0.0]), orientation, np.zeros((6, 6))
+        moved = np.array([x, y, 0.0]), orientation, np.zeros((6, 6)) if pose is not None else NOT_GIVEN
         when = self._when(f"odometry.{name}", stamp_ns)
         self._deliver(BesideEvent(*when, name, BASE, *moved, np.array([vx, vy, 0.0]), np.array([0.0, 0.0, w]), cov))
 
@@ -406,7 +407,7 @@ ODOMETRY = BuiltIn(
         Stream(
             ODOMETRIES,
             BesideEvent,
-            {"nav_msgs/msg/Odometry": from_odometry},
+            odometry_converters(BesideEvent),
             (),
             validator=odometry_validator,
             findings=OdometryChecks,

@@ -68,6 +68,16 @@ def test_a_bad_pose_leaves_the_twist_usable(gate):
     assert gate.rejections == {"odometry.pose_non_finite": 1}
 
 
+@pytest.mark.parametrize("lacking", ["pose", "twist"])
+def test_a_part_that_messages_do_not_have_is_no_rejection(gate, lacking):
+    values = ("position", "orientation") if lacking == "pose" else ("linear", "angular")
+    whole = odometry(1.0, (1.0, 2.0, 0.5), (0.1, 0.2))
+    none = {name: np.full_like(getattr(whole, name), np.nan) for name in (*values, f"{lacking}_cov")}
+    event = gate.check(replace(whole, **none))
+    assert np.isnan(getattr(event, values[0])).all()
+    assert not gate.rejections
+
+
 def test_an_odometry_without_any_usable_part_is_rejected(gate):
     assert gate.check(odometry(1.0, (np.nan, 0, 0), (0.1, 125.0))) is None
     assert gate.rejections == {"odometry.pose_non_finite": 1, "odometry.twist_yaw_rate_bound": 1}

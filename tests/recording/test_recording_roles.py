@@ -12,6 +12,7 @@ from fgloc.errors import RecordingError
 from fgloc.recording.reader import TopicInfo, open_recording, select_roles
 
 ODOMETRY, TWIST, IMU = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist", "sensor_msgs/msg/Imu"
+MEASURED, STAMPED = "geometry_msgs/msg/TwistWithCovarianceStamped", "geometry_msgs/msg/TwistStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 POSE, COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
@@ -35,6 +36,9 @@ def select(*topics: tuple[str, str], empty: tuple[tuple[str, str], ...] = (), **
         ([("/groundTruth", ODOMETRY)], {"truth": "/groundTruth"}),
         ([("/cmd_vel", "geometry_msgs/msg/TwistStamped")], {"command": "/cmd_vel"}),
         ([("/odom", ODOMETRY), ("/ekf", ODOMETRY)], {"odometry": "/odom"}),
+        ([("/wheel/twist", MEASURED)], {"odometry": "/wheel/twist"}),
+        ([("/wheel/twist", MEASURED), ("/pioneer/pose", ODOMETRY)], {"odometry": "/pioneer/pose"}),
+        ([("/truth/twist", MEASURED)], {}),
         ([("/robot/odom", ODOMETRY), ("/odometry/filtered", ODOMETRY)], {"odometry": "/robot/odom"}),
         ([("/imu/data", IMU), ("/imu/data_raw", IMU)], {"imu": "/imu/data"}),
         ([("/mocap/pose", POSE), ("/initialpose", COVARIANCE)], {"truth": "/mocap/pose"}),
@@ -60,6 +64,14 @@ def test_found_by_type_and_name(topics, roles):
     selection = select(*topics)
     assert selection.problems == ()
     assert selection.roles == roles
+
+
+@pytest.mark.parametrize(("name", "kind"), [("/vehicle/twist", STAMPED), ("/pose", POSE), ("/scan", COVARIANCE)])
+def test_poses_and_twists_are_odometry_where_the_configuration_names_them(name, kind):
+    selection = select((name, kind), odometry=name)
+    assert selection.problems == ()
+    assert selection.roles == {"odometry": name}
+    assert "odometry" not in select((name, kind)).roles
 
 
 @pytest.mark.parametrize(

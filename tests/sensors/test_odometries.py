@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from recording_bags import write_messages
 
 from fgloc import se2
 from fgloc.config import GateConfig, OdometryTopic, config_of
@@ -14,7 +15,7 @@ from fgloc.frames import yaw_quaternion
 from fgloc.recording.reader import TopicInfo, select_roles
 from fgloc.runner import run
 from fgloc.sensors.odometry import BesideEvent, BesideOdometry, CovarianceScale
-from fgloc.types import Step, by_class
+from fgloc.types import Severity, Step, by_class
 from fgloc_datasets.bag import BagWriter
 
 START = 1_600_000_000_000_000_000
@@ -214,3 +215,42 @@ def test_a_topic_that_is_not_there_is_an_error(tmp_path):
     config = config_of({"recording": {"odometries": [{"name": "visual", "topic": "/other"}]}})
     with pytest.raises(RecordingError, match=r"recording\.odometries: /other\b"):
         run(bag, None, config, "online")
+
+
+# --- Messages with a pose alone, or a twist alone ---------------------------------------------------------------------
+
+
+def message_of(kind, t):
+    """Content of a message of a robot on a circle, by its type."""
+    x, y, yaw = math.sin(0.4 * t), 1.0 - math.cos(0.4 * t), 0.4 * t
+    qx, qy, qz, qw = yaw_quaternion(yaw).tolist()
+    pose = {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
+    twist = {"linear": {"x": 0.4, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": 0.4}}
+    name, content = ("pose", pose) if "Pose" in kind else ("twist", twist)
+    if "Covariance" in kind:
+        content = {name: content, "covariance": [0.0] * 36}
+    stamp = START + round(t * 1e9)
+    header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "odom"}
+    return {"header": header, name: content}
+
+
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize(
+    "kind", ["PoseStamped", "PoseWithCovarianceStamped", "TwistStamped", "TwistWithCovarianceStamped"]
+)
+def test_a_run_drives_by_poses_or_twists_alone(tmp_path, kind, beside):
+    kind = f"geometry_msgs/msg/{kind}"
+    stamps = np.arange(0.0, 6.0, 0.05)
+    messages = [("/own", kind, START + round(t * 1e9), message_of(kind, t)) for t in stamps]
+    recording = {"odometries": [{"name": "visual", "topic": "/own"}]} if beside else {"topics": {"odometry": "/own"}}
+    if beside:
+        wheels = "geometry_msgs/msg/TwistWithCovarianceStamped"
+        messages += [("/wheels", wheels, START + round(t * 1e9), message_of(wheels, t)) for t in stamps]
+        recording["topics"] = {"odometry": "/wheels"}
+    result = run(write_messages(tmp_path / "bag", messages), None, config_of({"recording": recording}), mode="online")
+    assert not [finding for finding in result.findings if finding.severity == Severity.ERROR]
+    assert not result.rejections
+    begin, end = result.trajectory.poses[[0, -1]]
+    turned = 0.4 * (result.trajectory.stamps_ns[-1] - result.trajectory.stamps_ns[0]) * 1e-9
+    moved = se2.between(begin, end)
+    assert moved == pytest.approx([math.sin(turned), 1.0 - math.cos(turned), se2.wrap(turned)], abs=0.02)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from fgloc.config import Config
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.sensors.base import BASE, EventInput, When, matrix, vector, xyz, xyzw
+from fgloc.sensors.base import BASE, Converter, EventInput, When, matrix, vector, xyz, xyzw
 from fgloc.sensors.checks import (
     EMPTIED,
     PLANAR,
@@ -73,23 +73,42 @@ class JointsEvent(MotionEvent):
         return self.names
 
 
-def from_odometry(m: Any, when: When) -> Event:
-    """Event of a ``nav_msgs/Odometry``."""
-    return OdometryEvent(*when, *odometry_fields(m))
+NOT_GIVEN = np.full((6, 6), np.nan)
+"""Covariance of a pose or a twist that a message does not have; its values are NaN, too."""
 
 
-def odometry_fields(m: Any) -> tuple[Any, ...]:
-    """Fields of a `PoseAndTwistEvent` after the first three, of a ``nav_msgs/Odometry``."""
-    return (
-        m.header.frame_id,
-        m.child_frame_id,
-        xyz(m.pose.pose.position),
-        xyzw(m.pose.pose.orientation),
-        matrix(m.pose.covariance, 6),
-        xyz(m.twist.twist.linear),
-        xyz(m.twist.twist.angular),
-        matrix(m.twist.covariance, 6),
-    )
+def odometry_converters(kind: type[PoseAndTwistEvent]) -> dict[str, Converter]:
+    """Converters into one class of odometry events, by message type.
+
+    Messages that have no pose, or no twist, have NaN for it.
+    """
+
+    def whole(m: Any, when: When) -> Event:
+        pose, twist = (xyz(m.pose.pose.position), xyzw(m.pose.pose.orientation)), m.twist.twist
+        covariances = matrix(m.pose.covariance, 6), matrix(m.twist.covariance, 6)
+        frames = m.header.frame_id, m.child_frame_id
+        return kind(*when, *frames, *pose, covariances[0], xyz(twist.linear), xyz(twist.angular), covariances[1])
+
+    def twist_only(m: Any, twist: Any, covariance: FloatArray, when: When) -> Event:
+        none = np.full(3, np.nan), np.full(4, np.nan), NOT_GIVEN
+        return kind(*when, "", m.header.frame_id, *none, xyz(twist.linear), xyz(twist.angular), covariance)
+
+    def pose_only(m: Any, pose: Any, covariance: FloatArray, when: When) -> Event:
+        known = xyz(pose.position), xyzw(pose.orientation), covariance
+        return kind(*when, m.header.frame_id, "", *known, np.full(3, np.nan), np.full(3, np.nan), NOT_GIVEN)
+
+    none = np.zeros((6, 6))
+    return {
+        "nav_msgs/msg/Odometry": whole,
+        "geometry_msgs/msg/TwistWithCovarianceStamped": lambda m, when: twist_only(
+            m, m.twist.twist, matrix(m.twist.covariance, 6), when
+        ),
+        "geometry_msgs/msg/TwistStamped": lambda m, when: twist_only(m, m.twist, none, when),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m, when: pose_only(
+            m, m.pose.pose, matrix(m.pose.covariance, 6), when
+        ),
+        "geometry_msgs/msg/PoseStamped": lambda m, when: pose_only(m, m.pose, none, when),
+    }
 
 
 def from_joints(m: Any, when: When) -> Event:
@@ -115,6 +134,14 @@ _NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_co
 _NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
 
 
+_NOT_GIVEN = "not_given"
+
+
+def _not_given(covariance: FloatArray, *values: FloatArray) -> bool:
+    """Whether a message has no such part: everything of it is NaN."""
+    return math.isnan(covariance[0, 0]) and all(np.isnan(part).all() for part in (covariance, *values))
+
+
 def odometry_validator(checks: FieldChecks) -> Callable[[PoseAndTwistEvent], Event | str]:
     """Validator of odometry: pose and twist are judged apart."""
     bounds = checks.config
@@ -124,7 +151,9 @@ def odometry_validator(checks: FieldChecks) -> Callable[[PoseAndTwistEvent], Eve
         changes: Changes = {}
         vx, vy, vz = event.linear.tolist()
         wx, wy, wz = event.angular.tolist()
-        if not math.isfinite(vx + vy + vz + wx + wy + wz):
+        if _not_given(event.twist_cov, event.linear, event.angular):
+            twist = _NOT_GIVEN
+        elif not math.isfinite(vx + vy + vz + wx + wy + wz):
             twist = "non_finite"
         elif max(abs(vx), abs(vy), abs(vz)) > config.max_speed:
             twist = "speed_bound"
@@ -133,7 +162,9 @@ def odometry_validator(checks: FieldChecks) -> Callable[[PoseAndTwistEvent], Eve
         else:
             twist = checks.covariance(event.topic, "twist", event.twist_cov, PLANAR, "twist_cov", changes)
         x, y, z = event.position.tolist()
-        if not math.isfinite(x + y + z):
+        if _not_given(event.pose_cov, event.position, event.orientation):
+            pose = _NOT_GIVEN
+        elif not math.isfinite(x + y + z):
             pose = "non_finite"
         elif max(abs(x), abs(y), abs(z)) > config.max_position:
             pose = "position_bound"
@@ -142,11 +173,14 @@ def odometry_validator(checks: FieldChecks) -> Callable[[PoseAndTwistEvent], Eve
                 event.topic, "pose", event.pose_cov, PLANAR, "pose_cov", changes
             )
         if twist:
-            checks.rejections[f"odometry.twist_{twist}"] += 1
             changes |= _NO_TWIST
         if pose:
-            checks.rejections[f"odometry.pose_{pose}"] += 1
             changes |= _NO_POSE
+        if twist == pose == _NOT_GIVEN:
+            return "non_finite"
+        for part, reason in (("twist", twist), ("pose", pose)):
+            if reason and reason != _NOT_GIVEN:
+                checks.rejections[f"odometry.{part}_{reason}"] += 1
         if twist and pose:
             return EMPTIED
         return replace(event, **changes) if changes else event
@@ -233,10 +267,12 @@ class OdometryChecks:
         """Faults that were found, one sentence each."""
         rows = self._rows.array()
         found = []
-        finite = finite_rows(rows[:, :9])
+        posed, moved = (not np.isnan(rows[:, column]).all() for column in (9, 10))  # whether messages have the part
+        finite = finite_rows(rows[:, (0 if posed else 6) : (9 if moved else 6)])
         if not finite.all():
             found.append(f"{topic}: {count(~finite)} hold NaN or infinity and will be rejected.")
-        found += unit_length(topic, rows[finite, 2:6])
+        if posed:
+            found += unit_length(topic, rows[finite, 2:6])
         zero = [name for name, column in (("pose", 9), ("twist", 10)) if not rows[:, column].any()]
         if zero:
             found.append(f"{topic}: the covariance of {' and '.join(zero)} is all zero; the configured noise is used.")
@@ -250,9 +286,12 @@ class OdometryChecks:
         speed, rate = np.hypot(rows[:, 6], rows[:, 7]), np.abs(rows[:, 8])
         found = spikes(topic, "yaw rate", "rad/s", rate, config.gate.max_yaw_rate, seconds)
         found += spikes(topic, "speed", "m/s", speed, config.gate.max_speed, seconds)
-        steps = np.hypot(np.diff(x), np.diff(y))
-        turns = np.abs(np.diff(np.unwrap(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))))
         dt = np.maximum(np.diff(seconds), 0.0)
+        if np.isnan(x).all():
+            steps, turns = speed[:-1] * dt, rate[:-1] * dt
+        else:
+            steps = np.hypot(np.diff(x), np.diff(y))
+            turns = np.abs(np.diff(np.unwrap(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))))
         jumped = steps > config.gate.max_speed * dt + 0.5
         if jumped.any():
             at = int(np.argmax(np.where(jumped, steps, 0)))
@@ -262,7 +301,8 @@ class OdometryChecks:
             )
         whole = ~jumped & (dt <= config.gate.gap_s)  # what happened in a gap only the pose can know
         path, turned = float(steps[whole].sum()), float(turns[whole].sum())
-        if path > _MOVED_M and not speed.any() and not rate.any():
+        has_twist = not np.isnan(speed).all()
+        if has_twist and path > _MOVED_M and not speed.any() and not rate.any():
             found.append(
                 f"{topic}: the twist is always zero while the pose moves {path:.1f} m; "
                 "motion is taken from the pose (wheels.source: pose)."
@@ -273,7 +313,7 @@ class OdometryChecks:
             ("speed", "m", float((speed[:-1] * dt)[whole].sum()), path, 1.0),
             ("yaw rate", "rad", float((rate[:-1] * dt)[sane].sum()), float(turns[sane].sum()), 1.0),
         ):
-            if by_pose > least and not 0.7 < by_twist / by_pose < 1.4:
+            if has_twist and by_pose > least and not 0.7 < by_twist / by_pose < 1.4:
                 degrees = " (degrees for radians?)" if unit == "rad" and 40 < by_twist / by_pose < 75 else ""
                 found.append(
                     f"{topic}: the twist's {name} adds up to {by_twist:.1f} {unit}, the pose's to {by_pose:.1f} {unit}"
@@ -308,9 +348,10 @@ class WheelsInput(EventInput):
         position = np.array([x, y, 0.0])
         orientation = np.full(4, np.nan) if np.isnan(yaw) else yaw_quaternion(float(yaw))
         linear, angular = np.array([vx, vy, 0.0]), np.array([0.0, 0.0, w])
-        none = np.zeros((6, 6))
+        pose_cov, twist_cov = (NOT_GIVEN if part is None else np.zeros((6, 6)) for part in (pose, twist))
         when = self._when("odometry", stamp_ns)
-        self._deliver(OdometryEvent(*when, frame_id, BASE, position, orientation, none, linear, angular, none))
+        known = (position, orientation, pose_cov, linear, angular, twist_cov)
+        self._deliver(OdometryEvent(*when, frame_id, BASE, *known))
 
     def joints(
         self,

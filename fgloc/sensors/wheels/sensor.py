@@ -39,8 +39,8 @@ from fgloc.sensors.wheels.events import (
     from_ackermann,
     from_ackermann_stamped,
     from_joints,
-    from_odometry,
     joints_validator,
+    odometry_converters,
     odometry_validator,
 )
 from fgloc.sensors.wheels.motion import INSTALLATION
@@ -654,7 +654,7 @@ WHEELS = BuiltIn(
         Stream(
             "odometry",
             OdometryEvent,
-            {"nav_msgs/msg/Odometry": from_odometry},
+            odometry_converters(OdometryEvent),
             ("odom", "wheel_odom", "wheel_odometry", "wheel/odometry", "wheels/odom"),
             validator=odometry_validator,
             findings=OdometryChecks,
