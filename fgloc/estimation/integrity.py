@@ -181,15 +181,14 @@ class ProtectionLevels:
         """
         slip = self._slip(speed, since_fix_s, checked, slips_per_s, fix)
         self._modes.mounts.weigh()  # sightings that no slip can have come before
+        landmarks, mounts = self._modes.displaced(_DISPLACED), self._modes.mounts.displaced()
+        displaced = [(f"landmark {landmark_id}", share, bias, cov) for landmark_id, share, bias, cov in landmarks]
+        displaced += [(f"mounting of {sensor_name(kind)}", share, bias, cov) for kind, share, bias, cov in mounts]
+        likely = [one for one in displaced if one[1] > self._negligible]
+        added = _directions(np.array([spread for _, _, _, spread in likely]).reshape(-1, 3, 3))
         faults = [
-            _Fault(f"landmark {landmark_id}", share, np.abs(bias), _directions(spread))
-            for landmark_id, share, bias, spread in self._modes.displaced(_DISPLACED)
-            if share > self._negligible
-        ]
-        faults += [
-            _Fault(f"mounting of {sensor_name(kind)}", share, np.abs(bias), _directions(spread))
-            for kind, share, bias, spread in self._modes.mounts.displaced()
-            if share > self._negligible
+            _Fault(name, share, np.abs(bias), of_spread)
+            for (name, share, bias, _), of_spread in zip(likely, added, strict=True)
         ]
         if slip is not None and slip.share > self._negligible:
             faults.append(slip)

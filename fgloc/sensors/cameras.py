@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -243,14 +244,20 @@ def marker_pose_candidates(
 
     Source: Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014 (OpenCV's IPPE_SQUARE).
     """
-    ideal, corners = without_distortion(camera, corners_px)
+    return _candidates(camera, np.asarray(corners_px, dtype=np.float64).tobytes(), size_m)
+
+
+@lru_cache(maxsize=256)  # the estimator, its check and the diagnosis ask for the same markers
+def _candidates(camera: Camera, corners_px: bytes, size_m: float) -> tuple[tuple[FloatArray, float], ...]:
+    ideal, corners = without_distortion(camera, np.frombuffer(corners_px).reshape(4, 2))
     if not np.isfinite(corners).all():
         return ()
     # 1. Solve in a frame whose axes lie along the camera's: OpenCV turns the rotation into a vector and loses it where
     #    its angle is near 180 degrees, as that of an upright marker in an upright camera is.
     across = corners[1] - corners[0]
     quarter_turns = -round(math.atan2(across[1], across[0]) / (0.5 * math.pi))
-    turned = np.roll(corners, -quarter_turns, axis=0)[::-1]  # from the bottom left, counter-clockwise in the image
+    order = [(quarter_turns + k) % 4 for k in (3, 2, 1, 0)]
+    turned = corners[order]  # from the bottom left, counter-clockwise in the image
     try:
         _, rotations, translations, _ = cv2.solvePnPGeneric(
             _square(size_m), turned, ideal.K, None, flags=cv2.SOLVEPNP_IPPE_SQUARE

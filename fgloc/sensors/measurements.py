@@ -381,7 +381,7 @@ class PixelMeasurement(_OfLandmark):
         T = found[0][0]
         point = T[:3, 3]
         sigma_rad = self.sigma_px / float(self.camera.K[0, 0])
-        side_px = float(np.linalg.norm(self.corners_px - np.roll(self.corners_px, 1, axis=0), axis=1).max())
+        side_px = float(np.linalg.norm(self.corners_px - self.corners_px[[3, 0, 1, 2]], axis=1).max())
         return point, sigma_rad, float(np.linalg.norm(point)) * self.sigma_px / side_px
 
 
