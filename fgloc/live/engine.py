@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from fgloc.assembly import Assembly
-from fgloc.config import Config, Role, TopicsConfig, base_role
+from fgloc.config import ODOMETRIES, Config, Role, TopicsConfig, base_role
 from fgloc.errors import EstimatorError, FglocError, OutputError, unexpected
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.instrumentation import giving_way, one_blas_thread
@@ -71,11 +71,12 @@ class LiveStatus:
     def stale(self) -> str:
         """Sentence on sources that have all fallen silent, so that the pose is not of now; empty: they have not.
 
-        They are those of motion, or where there are none what sees landmarks.
+        They are those of motion, or where there are none what sees landmarks. An odometry beside the wheels goes on
+        when they fall silent; without any of them it is not used.
         """
-        sources = {topic: of for topic, of in self.topics.items() if of.role in MOTION} or {
-            topic: of for topic, of in self.topics.items() if base_role(of.role) in LOOK
-        }
+        moving = not set(MOTION).isdisjoint(of.role for of in self.topics.values())
+        roles = (*MOTION, ODOMETRIES) if moving else LOOK
+        sources = {topic: of for topic, of in self.topics.items() if base_role(of.role) in roles}
         missed = [of.silent_s for of in sources.values() if of.missed]
         if not missed or min(of.silent_s for of in sources.values()) < min(missed):
             return ""

@@ -1,13 +1,16 @@
 """A live run whose inputs have stopped says so, and since when."""
 
+from unittest.mock import Mock
+
 import pytest
-from live_feed import exit_code
+from live_feed import PATIENCE_S, exit_code
 
 from fgloc.cli.terminal import EXIT_LOST
 from fgloc.config import Config
 from fgloc.live import Live, live
 from fgloc.live.engine import LiveStatus, TopicStatus
-from fgloc.live.wire.node import described
+from fgloc.live.wire.node import Node, described
+from fgloc.live.wire.outputs import RecentPoses
 from fgloc.types import ControlEvent, Mode
 
 
@@ -62,3 +65,41 @@ def test_a_run_that_ends_without_its_pose_says_so_in_the_exit_code(mode):
 def test_where_nothing_tells_motion_silent_sightings_are_stale(others, is_stale):
     topics = {"/landmarks": TopicStatus("sightings", 50, 5.0, 0.0, 2.0, True), **others}
     assert LiveStatus(topics=topics).stale.startswith("STALE: no message of /landmarks") == is_stale
+
+
+@pytest.mark.parametrize(
+    ("topics", "is_stale"),
+    [
+        ({"/wheels": ("odometry", True), "/vo": ("odometries", False), "/tags": ("sightings", False)}, False),
+        ({"/wheels": ("odometry", True), "/vo": ("odometries", True), "/tags": ("sightings", False)}, True),
+        ({"/vo": ("odometries", False), "/tags": ("sightings", True)}, True),  # which is not used alone
+    ],
+)
+def test_an_odometry_beside_silent_wheels_tells_motion(topics, is_stale):
+    given = {
+        topic: TopicStatus(role, 99, 20.0, 0.0, 2.0 if missed else 0.01, missed)
+        for topic, (role, missed) in topics.items()
+    }
+    assert bool(LiveStatus(topics=given).stale) == is_stale
+
+
+def test_odometry_on_the_wire_never_goes_back_in_time_after_the_messages_have_stopped(clock):
+    """For 10 s the pose is propagated; then nothing is known of the present."""
+    network = Mock()
+    network.clock.return_value.now_ns = lambda: round(clock[0] * 1e9)
+    with Live(Config.model_validate({"estimator": {"initial_pose": (0.0, 0.0, 0.0)}}), roles=("command",)) as run:
+        drive(run, clock, 3.0)
+        assert run.wait(PATIENCE_S)
+        node = Node(network, Config(), None, process=Mock())
+        node.live, node._recent, node._outputs = run, RecentPoses(run.pose_at), Mock()
+        stamps = []
+        for _ in range(150):  # 15 s
+            node._publish_once()
+            stamps = [call.args[0].stamp_ns for call in node._outputs.odometry.call_args_list]
+            clock[0] += 0.1
+        assert stamps == sorted(stamps)
+        assert (stamps[-1] - stamps[0]) * 1e-9 == pytest.approx(10.0, abs=0.2)
+        drive(run, clock, 1.0)
+        assert run.wait(PATIENCE_S)
+        node._publish_once()
+        assert node._outputs.odometry.call_args.args[0].stamp_ns > stamps[-1]

@@ -250,7 +250,7 @@ class Node:
         self._given: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # pose and sigmas, before the run begins
         self._stopping = threading.Event()
         self._turn = 0  # of publishing
-        self._last_ns = 0  # stamp of the last odometry published
+        self._last: LivePose | None = None  # that was published
         self._T_map_odom: dict[str, FloatArray] = {}  # by name of the odometry frame
         if landmarks is not None:
             self._outputs.map(landmarks)
@@ -412,17 +412,25 @@ class Node:
         clock_ns = self._clock.now_ns()
         self._turn += 1
         ahead = self._recent.ahead(clock_ns) if self._turn % _ASKED_EVERY else None
-        now = ahead or self.live.pose_at(clock_ns) or self.live.pose_at()
-        if now is None or now.stamp_ns == self._last_ns:  # no time has passed: simulation time stands still
+        now = ahead or self.live.pose_at(clock_ns) or self._of_newest_message()
+        if now is None or (self._last is not None and now.stamp_ns == self._last.stamp_ns):  # simulation time stands
             return
         if ahead is None:
             self._recent.add(now)
-        self._last_ns = now.stamp_ns
+        self._last = now
         base = self._odom.base
         self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist(), now.ground), base)
         self.published["odometry"] += 1
         if self._as.tf:
             self._publish_transforms(now, base)
+
+    def _of_newest_message(self) -> LivePose | None:
+        """Pose at the newest message, for a clock that is not that of the messages; None: they have stopped."""
+        assert self.live is not None
+        newest, last = self.live.pose_at(), self._last
+        if newest is not None and last is not None and newest.keyframe_ns == last.keyframe_ns:
+            return newest if newest.stamp_ns > last.stamp_ns else None
+        return newest
 
     def _publish_transforms(self, now: LivePose, base: str) -> None:
         """Publish ``map → odom`` for each pose of the odometry, else ``map → base``.
