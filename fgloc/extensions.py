@@ -19,6 +19,7 @@ BUILT_IN = (
 )
 """Sensors of fgloc itself that are found in the same way as those of other packages."""
 _NEEDED = ("name", "Config", "streams", "failures", "build", "measure")
+_NEEDED_BY_OPTIONAL = ("needs", "purpose")
 
 
 @cache
@@ -39,7 +40,8 @@ def outside_sensors() -> tuple[type[Any], ...]:
             raise ConfigError(
                 f"{where} cannot be imported ({type(error).__name__}: {error}); repair or uninstall {package}"
             ) from error
-        missing = [name for name in _NEEDED if not hasattr(sensor, name)]
+        needed = (*_NEEDED, *(_NEEDED_BY_OPTIONAL if getattr(sensor, "optional", False) else ()))
+        missing = [name for name in needed if not hasattr(sensor, name)]
         if missing or sensor.name != point.name:
             wrong = f"lacks {', '.join(missing)}" if missing else f"has the name '{sensor.name}', expected that"
             raise ConfigError(f"{where} {wrong}; see docs/adding-a-sensor.md")

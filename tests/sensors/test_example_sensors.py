@@ -138,6 +138,10 @@ def test_without_the_package_its_section_is_an_unknown_key(folders, monkeypatch,
     [
         ("raise RuntimeError('no driver')", "RuntimeError: no driver.* broken"),
         ("class Sensor: name = 'lidar'", "Config, streams"),
+        (
+            "class Sensor: name, streams, optional = 'lidar', (), True; Config = failures = build = measure = None",
+            "lacks needs, purpose",
+        ),
     ],
 )
 def test_a_package_that_is_no_sensor_is_named(tmp_path, monkeypatch, module, wrong):
