@@ -41,6 +41,7 @@ class _State:
     compared_s: float = 0.0
     still: FloatArray = field(default_factory=lambda: np.zeros(2))  # m, rad that the others went while it repeated ...
     still_steps: int = 0  # ... and for how many steps it has repeated
+    differing_steps: int = 0  # of the running episode
     wheels_wrong: bool = False  # in the running episode, by sightings
     reason: str = ""  # of the running episode
 
@@ -162,11 +163,14 @@ class OdometriesBeside:
             state.reason, state.wheels_wrong = "", False
             return source.name, "", 0
         source.scale.interrupt()
-        if not state.wheels_wrong and self._attribution is not None:
-            found = self._attribution.contradicted(max(verdict.since, 1))
-            state.wheels_wrong = found is not None and "wheels" in found.sources and source.name not in found.sources
+        state.differing_steps = verdict.since or state.differing_steps + 1
         if state.wheels_wrong:
-            return "wheels", "slip", verdict.since
+            return "wheels", "slip", 0
+        found = None if self._attribution is None else self._attribution.contradicted(state.differing_steps)
+        if found is not None and "wheels" in found.sources and source.name not in found.sources:
+            state.wheels_wrong = True
+            self.flags -= Counter({f"{source.name}.{state.reason}": 1})  # what it was taken for until now
+            return "wheels", "slip", verdict.since or found.steps
         stood = np.hypot(*own.motion[:2]) < _STOOD * went[0] and abs(own.motion[2]) < max(_STOOD * went[1], 0.01)
         kind = state.reason or ("frozen" if stood else "jumped" if verdict.since == 1 else "deviates")
         return source.name, self._noted(source.name, state, kind), verdict.since

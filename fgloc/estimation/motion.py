@@ -908,6 +908,9 @@ class MotionJudge:
         changed: dict[int, Sequence[MotionMeasurement]] = {}
         rows: list[Decision] = []
         log = self._estimator.log.keyframes
+        before = log[newest].budget.rejected if newest in log else {}
+        if "wheels" in found.rejected and "wheels" not in {**before, **verdict.budget.rejected}:
+            self._faults.flags["wheels.slip"] += 1
         for frame in (log[i] for i in range(newest - span + 2, newest + 1) if i in log):
             if frame.prior is not None or found.rejected.keys() <= frame.budget.rejected.keys():
                 continue

@@ -1,10 +1,12 @@
 """Odometries beside the wheels: motion, derivatives, covariance, faults, and whole runs with them."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from recording_bags import write_messages
+from robot_world import START_NS, Chain, World, config, position_error, room
 
 from fgloc import se2
 from fgloc.config import GateConfig, OdometryTopic, config_of
@@ -15,6 +17,7 @@ from fgloc.frames import yaw_quaternion
 from fgloc.recording.reader import TopicInfo, select_roles
 from fgloc.runner import run
 from fgloc.sensors.odometry import BesideEvent, BesideOdometry, CovarianceScale
+from fgloc.sensors.wheels.events import OdometryEvent
 from fgloc.types import Severity, Step, by_class
 from fgloc_datasets.bag import BagWriter
 
@@ -254,3 +257,43 @@ def test_a_run_drives_by_poses_or_twists_alone(tmp_path, kind, beside):
     turned = 0.4 * (result.trajectory.stamps_ns[-1] - result.trajectory.stamps_ns[0]) * 1e-9
     moved = se2.between(begin, end)
     assert moved == pytest.approx([math.sin(turned), 1.0 - math.cos(turned), se2.wrap(turned)], abs=0.02)
+
+
+# --- On a known map: sightings tell which is wrong --------------------------------------------------------------------
+
+
+def with_visual(made, wheels=lambda t: 1.0):
+    """The chain of a run with an odometry beside the wheels, whose speed is multiplied, and its estimates."""
+    settings = config(recording={"odometries": [{"name": "visual", "topic": "/vo", "pose": [0.0, 0.0, 0.0]}]})
+    source = BesideOdometry(settings.recording.odometries[0], settings.gate, lambda name: None)
+    chain, events = Chain(settings, made.map, beside=(source,)), []
+    for e in made.events():
+        factor = wheels((e.stamp_ns - START_NS) * 1e-9) if isinstance(e, OdometryEvent) else 1.0
+        events.append(e if factor == 1.0 else replace(e, linear=factor * e.linear))
+    for stamp in range(START_NS + 1, START_NS + round(made.seconds * 1e9), 50_000_000):
+        x, y, yaw = made.truth(stamp)
+        where = np.array([x, y, 0.0]), yaw_quaternion(yaw), 1e-6 * np.eye(6)
+        events.append(BesideEvent(stamp, stamp, "/vo", "vo", "", *where, np.zeros(3), np.zeros(3), NONE))
+    return chain, chain.run(sorted(events, key=lambda e: e.received_ns))
+
+
+@pytest.mark.parametrize("factor", [1.3, 2.0])
+def test_wheels_that_slip_beside_a_sound_odometry_are_named_and_counted(factor):
+    """A slip shows after some steps, which are judged again; until then the odometry is taken to be wrong."""
+    made = World(room(), seconds=24.0)
+    chain, estimates = with_visual(made, lambda t: factor if 10.0 <= t < 13.0 or 17.0 <= t < 20.0 else 1.0)
+    last = {(d.stamp_ns, d.kind): d for e in estimates for d in e.decisions}
+    slipped = [(t - START_NS) * 1e-9 for (t, kind), d in last.items() if kind == "wheels" and d.reason == "slip"]
+    during = [t for t in slipped if 10.0 <= t < 14.5 or 17.0 <= t < 21.5]
+    assert len(during) == len(slipped) > 30
+    assert chain.localizer.motion.slips_per_s == pytest.approx(2.0 / (60.0 + 24.0), rel=0.01)
+    (note,) = chain.localizer.motion.notes
+    assert "the wheels" in note
+    assert " 2 time(s): they slipped" in note
+    assert max(position_error(e, made.truth(e.stamp_ns)) for e in estimates) < 0.06
+
+
+def test_an_odometry_beside_wheels_that_fall_silent_tells_the_motion():
+    made = World(room(), seconds=22.0, dumb=((10.0, 22.0),), blind=((11.0, 22.0),))
+    _, estimates = with_visual(made)
+    assert max(position_error(e, made.truth(e.stamp_ns)) for e in estimates) < 0.06
