@@ -98,7 +98,7 @@ class Localizer:
     def _advance(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate:
         """The loop from one keyframe to the next."""
         # 3. Judge the motion sources against each other, then the sightings against the pose that they predict
-        with self.stopwatch("weigh"):
+        with self.stopwatch("judge"):
             motion = self.motion.judge(step, readings)
             motion, seen = self.sightings.judge(step, sightings, motion)
         if seen.elsewhere is not None:

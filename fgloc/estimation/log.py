@@ -9,7 +9,6 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import BESIDE
-from fgloc.estimation.faults import FaultVerdict
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import NoiseBudget
 from fgloc.sensors import registry
@@ -35,11 +34,16 @@ _OF_BESIDE = {
 
 
 def motion_decisions(
-    k: int, motions: Sequence[MotionMeasurement], readings: MotionReadings, budget: NoiseBudget, verdict: FaultVerdict
+    k: int,
+    motions: Sequence[MotionMeasurement],
+    readings: MotionReadings,
+    budget: NoiseBudget,
+    glr: float = math.nan,
+    alarm: float = math.nan,
 ) -> list[Decision]:
     """Rows of ``steps.csv`` for the motion of a step: the residual is that against the wheels.
 
-    That of the wheels is the statistic of the GLR test of the ``verdict``, and its threshold the alarm.
+    That of the wheels is the statistic ``glr`` of the GLR test, if there is one, and its threshold the ``alarm``.
 
     Rejected sources have weight 0, and so have all the others where sightings overruled them, as they no longer hold
     the pose. Otherwise the weight is one over the factor on the covariance. A step that was judged again has more than
@@ -56,8 +60,8 @@ def motion_decisions(
             continue
         nis, threshold, shift = 0.0, math.nan, math.nan
         reference = readings.learned if reading is readings.wheels else readings.wheels
-        if reading is readings.wheels and math.isfinite(verdict.nis):
-            nis, threshold = verdict.nis, verdict.threshold
+        if reading is readings.wheels and math.isfinite(glr):
+            nis, threshold = glr, alarm
         if reference is not None:
             difference: FloatArray = se2.log(se2.between(reference.motion, reading.motion))
             shift = math.nan if reading is readings.gyro else float(difference[0])

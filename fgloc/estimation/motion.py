@@ -774,14 +774,16 @@ class JudgedMotion:
         factors: independent of each other; at least one.
         readings: what they were made of, to make them anew; empty if the robot was carried.
         budget: the noise that they were made with.
-        verdict: on the sources, back to the onset of a fault.
+        nis: of the difference of wheels and reference source, see `FaultVerdict` ...
+        threshold: ... and what it is held against.
         revisions: rows of ``steps.csv`` of earlier steps whose motion was combined anew.
     """
 
     factors: tuple[MotionMeasurement, ...]
     readings: MotionReadings
     budget: NoiseBudget
-    verdict: FaultVerdict
+    nis: float
+    threshold: float
     revisions: tuple[Decision, ...] = ()
 
     def overruled(self, cov: FloatArray) -> JudgedMotion:
@@ -791,7 +793,7 @@ class JudgedMotion:
 
     def decisions(self, k: int) -> list[Decision]:
         """Rows of ``steps.csv``, with those of earlier steps first."""
-        return motion_decisions(k, self.factors, self.readings, self.budget, self.verdict)
+        return motion_decisions(k, self.factors, self.readings, self.budget, self.nis, self.threshold)
 
 
 class MotionJudge:
@@ -869,13 +871,12 @@ class MotionJudge:
         factors = tuple(self.combine(step, readings, verdict.budget))
         budget = self._with_drift(verdict.budget, step, readings, factors)
         if budget is not verdict.budget:
-            verdict = replace(verdict, budget=budget)
             factors = tuple(self.combine(step, readings, budget))
         if self._lift.carried:
-            return JudgedMotion(factors, MotionReadings(), _carried(), verdict, revisions)
-        if factors[0].source == "unknown" and not self.sources.unmeasured:
+            readings, budget = MotionReadings(), _carried()
+        elif factors[0].source == "unknown" and not self.sources.unmeasured:
             self.rejections["motion.silent"] += 1
-        return JudgedMotion(factors, readings, verdict.budget, verdict, revisions)
+        return JudgedMotion(factors, readings, budget, verdict.nis, verdict.threshold, revisions)
 
     def _with_drift(
         self, budget: NoiseBudget, step: Step, readings: MotionReadings, factors: Sequence[MotionMeasurement]
@@ -904,23 +905,17 @@ class MotionJudge:
         found = self.sources.beside.judge(step, others)
         if not found.rejected:
             return verdict, ()
-        newest, span = self._estimator.k, found.span
-        changed: dict[int, Sequence[MotionMeasurement]] = {}
-        rows: list[Decision] = []
-        log = self._estimator.log.keyframes
-        before = log[newest].budget.rejected if newest in log else {}
+        newest = self._estimator.log.keyframes.get(self._estimator.k)
+        before = {} if newest is None else newest.budget.rejected
         if "wheels" in found.rejected and "wheels" not in {**before, **verdict.budget.rejected}:
             self._faults.flags["wheels.slip"] += 1
-        for frame in (log[i] for i in range(newest - span + 2, newest + 1) if i in log):
-            if frame.prior is not None or found.rejected.keys() <= frame.budget.rejected.keys():
-                continue
-            frame.budget = replace(frame.budget, rejected={**found.rejected, **frame.budget.rejected})
-            if motions := frame.budget.combine(frame.readings, self.sources.rules):
-                changed[frame.k] = motions
-                rows += motion_decisions(frame.k, motions, frame.readings, frame.budget, verdict)
-        self._estimator.revise(changed)
+        budgets = {
+            frame.k: replace(frame.budget, rejected={**found.rejected, **frame.budget.rejected})
+            for frame in self._newest_steps(found.span)
+            if not found.rejected.keys() <= frame.budget.rejected.keys()
+        }
         budget = replace(verdict.budget, rejected={**found.rejected, **verdict.budget.rejected})
-        return replace(verdict, budget=budget), tuple(rows)
+        return replace(verdict, budget=budget), self._combine_anew(budgets, verdict)
 
     def commit(self, motion: JudgedMotion, fix: PoseWithCovariance | None, observes_yaw: bool) -> None:
         """Update bias and drift of the sources after a step, see `MotionSources.commit`."""
@@ -974,22 +969,32 @@ class MotionJudge:
         """
         if not verdict.earlier.rejected and verdict.earlier.scale < COVARIANCE_FACTOR:
             return ()
-        log, newest = self._estimator.log.keyframes, self._estimator.k
-        changed: dict[int, Sequence[MotionMeasurement]] = {}
-        decisions: list[Decision] = []
-        first = newest - verdict.span + 2
-        frames = (log[i] for i in range(min(first, newest - verdict.doubted + 2), newest + 1) if i in log)
-        for frame in (f for f in frames if f.prior is None):
+        first = self._estimator.k - verdict.span + 2
+        budgets = {}
+        for frame in self._newest_steps(max(verdict.span, verdict.doubted)):
             judged = frame.budget.rejected.get("wheels", DOUBTED) != DOUBTED  # soundly, in a stretch of doubt
-            revised = None if judged and frame.k < first else _revised(frame, verdict.earlier)
-            if revised is None:
-                continue
-            frame.budget = revised
-            if motions := revised.combine(frame.readings, self.sources.rules):
-                changed[frame.k] = motions
-                decisions += motion_decisions(frame.k, motions, frame.readings, revised, verdict)
+            if (frame.k >= first or not judged) and (revised := _revised(frame, verdict.earlier)) is not None:
+                budgets[frame.k] = revised
+        return self._combine_anew(budgets, verdict)
+
+    def _newest_steps(self, span: int) -> list[Keyframe]:
+        """Keyframes of so many newest steps, without that of the step which is judged now; with a motion to them."""
+        log, newest = self._estimator.log.keyframes, self._estimator.k
+        frames = (log[k] for k in range(newest - span + 2, newest + 1) if k in log)
+        return [frame for frame in frames if frame.prior is None]
+
+    def _combine_anew(self, budgets: Mapping[int, NoiseBudget], verdict: FaultVerdict) -> tuple[Decision, ...]:
+        """Give keyframes other budgets; rows of ``steps.csv`` for the motions that enter the graph instead."""
+        changed: dict[int, Sequence[MotionMeasurement]] = {}
+        rows: list[Decision] = []
+        for k, budget in budgets.items():
+            frame = self._estimator.log.keyframes[k]
+            frame.budget = budget
+            if motions := budget.combine(frame.readings, self.sources.rules):
+                changed[k] = motions
+                rows += motion_decisions(k, motions, frame.readings, budget, verdict.nis, verdict.threshold)
         self._estimator.revise(changed)
-        return tuple(decisions)
+        return tuple(rows)
 
 
 def _carried() -> NoiseBudget:

@@ -15,7 +15,6 @@ from scipy.stats import chi2
 
 from fgloc import se2
 from fgloc.config import Config, GyroConfig, MotionConfig, WheelsConfig
-from fgloc.estimation.faults import FaultVerdict
 from fgloc.estimation.log import motion_decisions
 from fgloc.estimation.motion import MotionFaultMonitor, MotionSources, TurnComparison, source_difference
 from fgloc.graph.factors import LandmarkFactors
@@ -242,7 +241,7 @@ def test_weights_of_a_step_say_what_happened_to_its_covariances(tmp_path, reject
     readings = MotionReadings(WHEELS, LEARNED)
     budget = NoiseBudget(rejected, scale)
     made = budget.combine(readings, sources(learned_motion(tmp_path)).rules)
-    rows = {d.kind: d for d in motion_decisions(3, made, readings, budget, FaultVerdict(budget))}
+    rows = {d.kind: d for d in motion_decisions(3, made, readings, budget)}
     assert (rows["wheels"].weight, rows["learned"].weight) == pytest.approx(weights)
     for m in made:
         given = {"wheels": W, "learned": N}[m.source]
