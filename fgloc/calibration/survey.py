@@ -26,7 +26,7 @@ from fgloc.frames import homogeneous
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
-from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance
+from fgloc.graph.measurement_log import Keyframe, LoggedSighting, MeasurementLog, PoseWithCovariance
 from fgloc.graph.observation import Observations
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, smooth_run
@@ -638,8 +638,8 @@ class SurveyGraph:
                 if frame.prior is not None:
                     origin = n == 0 and not leg.free
                     prior = PoseWithCovariance(frame.prior.pose, _ORIGIN) if origin else PoseWithCovariance(pose, _FREE)
-                accepted: list[LandmarkFactor] = []
-                rejected: list[LandmarkFactor] = []
+                accepted: list[LoggedSighting] = []
+                rejected: list[LoggedSighting] = []
                 for m in seen:
                     agrees = m.stamp_ns in leg.agreeing.get(m.landmark_id, ())
                     (accepted if agrees else rejected).append(factors.sighting(k, m, m.cauchy_k))

@@ -24,7 +24,7 @@ from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
-from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.graph.measurement_log import LoggedSighting, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
 from fgloc.graph.observation import Lines, Observations
 from fgloc.sensors.measurements import LandmarkMeasurement
@@ -434,8 +434,8 @@ class LandmarkModes:
         motions: Sequence[MotionMeasurement],
         predicted: PoseWithCovariance,
         belief: PoseWithCovariance,
-        fused: Sequence[LandmarkFactor],
-        rejected: Sequence[LandmarkFactor] = (),
+        fused: Sequence[LoggedSighting],
+        rejected: Sequence[LoggedSighting] = (),
         lines: Lines | None = None,
     ) -> int | None:
         """Follow the estimator through one keyframe.

@@ -35,7 +35,7 @@ from fgloc.graph.estimators import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
 from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
-from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.graph.measurement_log import LoggedSighting, PoseWithCovariance
 from fgloc.graph.noise import repetition
 from fgloc.graph.observation import Lines
 from fgloc.sensors.measurements import LandmarkMeasurement, points_of
@@ -73,7 +73,7 @@ class Association:
         stamp_ns: int,
         measurements: Sequence[LandmarkMeasurement],
         predicted: PoseWithCovariance,
-    ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
+    ) -> tuple[list[LoggedSighting], list[LoggedSighting], list[Decision]]:
         """Sort sightings into accepted and rejected, with the decision on each.
 
         The NIS is that of the prediction, with what is not known of the installation. Where it fails the χ² gate and
@@ -116,7 +116,7 @@ class Association:
             )
             self._contradicting.update(range(-contradictions(nameless), 0))
         for m, nis, reason in ((one.hit, one.nis, one.reason) for one in nameless):
-            rejected.append(LandmarkFactor(m, m, m.cauchy_k))
+            rejected.append(LoggedSighting(m, m, m.cauchy_k))
             self.rejections[f"{m.counted_as}.{reason}"] += 1
             decisions.append(
                 Decision(k, stamp_ns, m.row_kind, m.row_id, nis**0.5, nis, m.dof, 0.0, reason, self._gate(m.dof))
@@ -182,10 +182,10 @@ class Association:
         self,
         k: int,
         stamp_ns: int,
-        rejected: Sequence[LandmarkFactor],
+        rejected: Sequence[LoggedSighting],
         decisions: list[Decision],
         predicted: PoseWithCovariance,
-    ) -> list[tuple[LandmarkFactor, LandmarkFactor, Decision]]:
+    ) -> list[tuple[LoggedSighting, LoggedSighting, Decision]]:
         """Rejected markers whose code was misread: what was rejected, what it was, and the decision on that.
 
         Beside others that are accepted, a marker that cannot be where it was seen, in a place where exactly one other
@@ -228,7 +228,7 @@ class Association:
         return found
 
     def nearby_consensus(
-        self, rejected: Sequence[LandmarkFactor], decisions: Sequence[Decision], predicted: PoseWithCovariance
+        self, rejected: Sequence[LoggedSighting], decisions: Sequence[Decision], predicted: PoseWithCovariance
     ) -> Fit | None:
         """The place nearby that rejected sightings agree on, if they are of two landmarks or more and are unambiguous.
 
@@ -397,9 +397,9 @@ class JudgedSightings:
         elsewhere: where on the map the robot is instead; None: it is where it was predicted.
     """
 
-    accepted: Sequence[LandmarkFactor]
-    rejected: Sequence[LandmarkFactor]
-    logged: Sequence[LandmarkFactor]
+    accepted: Sequence[LoggedSighting]
+    rejected: Sequence[LoggedSighting]
+    logged: Sequence[LoggedSighting]
     decisions: Sequence[Decision]
     predicted: PoseWithCovariance
     lines: Lines | None = None

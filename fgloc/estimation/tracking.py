@@ -14,7 +14,7 @@ from fgloc.estimation.place import ANYWHERE, ORIGIN, GlobalSearch, InitialPose
 from fgloc.estimation.pose_fit import MAX_SIGMA, apart
 from fgloc.estimation.unnamed import AMBIGUOUS
 from fgloc.graph.factors import LandmarkFactors
-from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.graph.measurement_log import LoggedSighting, PoseWithCovariance
 from fgloc.sensors.measurements import LandmarkMeasurement
 from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, MotionMeasurement, MotionReadings, Step
 
@@ -111,8 +111,8 @@ class Tracking:
         return self._given and self._contradicting >= max(self._confirming, 1)
 
     def gate_initial_pose(
-        self, accepted: list[LandmarkFactor], rejected: list[LandmarkFactor], decisions: list[Decision]
-    ) -> tuple[list[LandmarkFactor], list[LandmarkFactor], list[Decision]]:
+        self, accepted: list[LoggedSighting], rejected: list[LoggedSighting], decisions: list[Decision]
+    ) -> tuple[list[LoggedSighting], list[LoggedSighting], list[Decision]]:
         """Judge a given first pose by the verdicts of `Association.judge`; while it contradicts them, accept none.
 
         One that agrees with a contradicted pose does so by accident, and would drag it along.

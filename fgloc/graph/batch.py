@@ -21,7 +21,7 @@ from fgloc.graph.batch_factors import BatchMotions, BatchSightings, GroundMotion
 from fgloc.graph.factors import INSTALLATION, LandmarkFactors, ground_key, landmark_key, pose_key, prior_factor
 from fgloc.graph.installation import GROUND, InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, fuse
-from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog
+from fgloc.graph.measurement_log import Keyframe, LoggedSighting, MeasurementLog
 from fgloc.graph.noise import whitening_of
 from fgloc.sensors.measurements import seen_since_knocked
 from fgloc.stats import ROUNDING, chi2_bound
@@ -50,7 +50,7 @@ def with_deep_stack(work: Callable[[], _T]) -> _T:
 
 
 def initial_values(
-    frames: list[Keyframe], accepted: Mapping[int, tuple[LandmarkFactor, ...]], factors: LandmarkFactors
+    frames: list[Keyframe], accepted: Mapping[int, tuple[LoggedSighting, ...]], factors: LandmarkFactors
 ) -> gtsam.Values:
     """Initial values of the batch: poses, landmarks and installation as the incremental estimator has them."""
     return values_at(frames, [frame.belief.pose for frame in frames], accepted, factors)
@@ -70,7 +70,7 @@ def dead_reckoned(frames: Sequence[Keyframe]) -> list[FloatArray]:
 def values_at(
     frames: list[Keyframe],
     poses: Sequence[FloatArray],
-    accepted: Mapping[int, tuple[LandmarkFactor, ...]],
+    accepted: Mapping[int, tuple[LoggedSighting, ...]],
     factors: LandmarkFactors,
 ) -> gtsam.Values:
     """Values with these poses of the keyframes, and the landmarks where they are seen from there."""
@@ -174,7 +174,7 @@ def without_orphans(values: gtsam.Values, graph: gtsam.NonlinearFactorGraph) -> 
 
 
 def estimated_landmarks(
-    accepted: Mapping[int, tuple[LandmarkFactor, ...]],
+    accepted: Mapping[int, tuple[LoggedSighting, ...]],
     values: gtsam.Values,
     marginals: Solved,
 ) -> dict[int, Landmark]:
@@ -237,7 +237,7 @@ def of_whole_run(log: MeasurementLog, factors: LandmarkFactors) -> LandmarkFacto
     return factors
 
 
-def _renamed(sighting: LandmarkFactor, kind: str, name: str) -> LandmarkFactor:
+def _renamed(sighting: LoggedSighting, kind: str, name: str) -> LoggedSighting:
     measurement, alone = (seen_since_knocked(m, kind, name) for m in (sighting.measurement, sighting.alone))
     return replace(sighting, measurement=measurement, alone=alone)
 
@@ -395,7 +395,7 @@ class BatchSmoother:
         if self._sightings is None:
             for frame in self.frames:
                 kept = self.accepted[frame.k]
-                total += sum(f.error(self._values) for s in kept for f in s.factors)
+                total += sum(s.factor.error(self._values) for s in kept if s.factor is not None)
                 left_out = [s for s in frame.sightings if s not in kept]
                 total += sum(0.5 * chi2_bound(self._probability, _dof(s)) for s in left_out)
             return total
@@ -538,8 +538,9 @@ class BatchSmoother:
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
         graph = self._of_motion()
         if self._sightings is None:
-            for factor in (f for held in self.accepted.values() for s in held for f in s.factors):
-                graph.add(factor)
+            for sighting in (s for held in self.accepted.values() for s in held):
+                if sighting.factor is not None:
+                    graph.add(sighting.factor)
             return graph
         for factor in self._sightings.factors(self._whole_poses(), self._theta(), self._values):
             graph.add(factor)
@@ -591,22 +592,23 @@ def _eliminated(
     return root, root.optimize()
 
 
-def _seen(frame: Keyframe) -> tuple[LandmarkFactor, ...]:
+def _seen(frame: Keyframe) -> tuple[LoggedSighting, ...]:
     return (*frame.sightings, *frame.rejected)
 
 
-def _nis(sighting: LandmarkFactor, values: gtsam.Values) -> float:
-    """Squared whitened residual without the kernel, from ``e = k²/2 · log(1 + r²/k²)`` of each robust factor."""
-    total = 0.0
-    for factor in sighting.factors:
-        error = factor.error(values)
-        k2 = None if sighting.cauchy_k is None else sighting.cauchy_k**2
-        total += 2.0 * error if k2 is None else k2 * math.expm1(min(2.0 * error / k2, _LARGEST_LOG))
-    return total
+def _nis(sighting: LoggedSighting, values: gtsam.Values) -> float:
+    """Squared whitened residual without the kernel, from ``e = k²/2 · log(1 + r²/k²)`` of a robust factor."""
+    if sighting.factor is None:
+        return 0.0
+    error = 2.0 * sighting.factor.error(values)
+    if sighting.cauchy_k is None:
+        return error
+    k2 = sighting.cauchy_k**2
+    return k2 * math.expm1(min(error / k2, _LARGEST_LOG))
 
 
-def _dof(sighting: LandmarkFactor) -> int:
-    return sum(factor.dim() for factor in sighting.factors)
+def _dof(sighting: LoggedSighting) -> int:
+    return 0 if sighting.factor is None else sighting.factor.dim()
 
 
 def _vector(pose: gtsam.Pose2) -> FloatArray:

@@ -24,7 +24,7 @@ from fgloc.graph.factors import (
 )
 from fgloc.graph.ground import gravity, gravity_factor, ground_prior, step_factors, step_of
 from fgloc.graph.installation import GROUND, Installation
-from fgloc.graph.measurement_log import Keyframe, LandmarkFactor
+from fgloc.graph.measurement_log import Keyframe, LoggedSighting
 from fgloc.graph.noise import whitening_of
 from fgloc.graph.observation import Linearized, Lines, Observations, Stacked
 from fgloc.types import FloatArray, IntArray
@@ -113,7 +113,7 @@ class BatchSightings:
     """
 
     def __init__(
-        self, frames: Sequence[Keyframe], accepted: Sequence[Sequence[LandmarkFactor]], factors: LandmarkFactors
+        self, frames: Sequence[Keyframe], accepted: Sequence[Sequence[LoggedSighting]], factors: LandmarkFactors
     ) -> None:
         """Prepare what was accepted at each keyframe."""
         self._installation = factors.installation
@@ -160,7 +160,7 @@ class BatchSightings:
 class _Images:
     """Sightings of some keyframes, grouped by image."""
 
-    def __init__(self, held: Sequence[tuple[int, int, LandmarkFactor]], factors: LandmarkFactors) -> None:
+    def __init__(self, held: Sequence[tuple[int, int, LoggedSighting]], factors: LandmarkFactors) -> None:
         """Prepare the sightings, each given with the row and the number of its keyframe."""
         self._row = np.array([i for i, _, _ in held], dtype=np.int64)
         self._k = np.array([k for _, k, _ in held], dtype=np.int64)
@@ -232,7 +232,7 @@ class _Images:
                 yield from sighting_factors(int(self._k[start]), *kept, own[start], there, constants)
 
     def _of_keyframe(
-        self, sightings: Sequence[LandmarkFactor], pose: FloatArray, theta: FloatArray
+        self, sightings: Sequence[LoggedSighting], pose: FloatArray, theta: FloatArray
     ) -> list[Linearized]:
         measurements = [s.measurement for s in sightings]
         return Observations(measurements, self._landmarks, self._installation).linearize(pose, theta)

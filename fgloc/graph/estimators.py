@@ -30,7 +30,7 @@ from fgloc.graph.factors import (
 from fgloc.graph.ground import ground_factors, ground_prior, is_level_known, levelled, predict, starting, step_of
 from fgloc.graph.installation import GROUND, VACANT_SIGMA, Installation, InstallationEstimate, installation_of
 from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov, split
-from fgloc.graph.measurement_log import Keyframe, LandmarkFactor, MeasurementLog, PoseWithCovariance, Remounting
+from fgloc.graph.measurement_log import Keyframe, LoggedSighting, MeasurementLog, PoseWithCovariance, Remounting
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.learned.sensor import gains_of
 from fgloc.sensors.measurements import LandmarkMeasurement
@@ -97,7 +97,7 @@ class Estimator(ABC):
         return self.log.keyframes[k].belief.pose if k in self.log.keyframes else None
 
     def start(
-        self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LandmarkFactor] = ()
+        self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LoggedSighting] = ()
     ) -> PoseWithCovariance:
         """Begin a segment: a first pose with a prior, unconnected to what was before."""
         self._k += 1
@@ -144,8 +144,8 @@ class Estimator(ABC):
         stamp_ns: int,
         dt: float,
         motions: Sequence[MotionMeasurement],
-        sightings: Sequence[LandmarkFactor] = (),
-        rejected: Sequence[LandmarkFactor] = (),
+        sightings: Sequence[LoggedSighting] = (),
+        rejected: Sequence[LoggedSighting] = (),
         predicted: PoseWithCovariance | None = None,
     ) -> PoseWithCovariance:
         """Add one keyframe with its measurements; return the filtered pose.
@@ -811,7 +811,7 @@ class IncrementalEstimator(Estimator):
                 made += sighting_factors(frame.k, sightings, lines, initial.pose, known.mean, constants)
         for sighting in frame.sightings:
             self._introduce(sighting.measurement, initial.pose, values)
-            made += sighting.factors
+            made += [] if sighting.factor is None else [sighting.factor]
         for factor in made:
             graph.add(factor)
         return graph, values

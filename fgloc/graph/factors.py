@@ -19,7 +19,7 @@ from fgloc import se2
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.frames import rotations
 from fgloc.graph.installation import Installation, InstallationEstimate, camera_block
-from fgloc.graph.measurement_log import LandmarkFactor, PoseWithCovariance
+from fgloc.graph.measurement_log import LoggedSighting, PoseWithCovariance
 from fgloc.graph.noise import covariance_problem, gaussian, robust, sighting_whitening, whitening_of
 from fgloc.graph.observation import Lines, Observations
 from fgloc.sensors.measurements import FrameMeasurement, LandmarkMeasurement, PointMeasurement
@@ -141,7 +141,7 @@ def installed_prior_factor(
 
 def sighting_factors(
     k: int,
-    sightings: Sequence[LandmarkFactor],
+    sightings: Sequence[LoggedSighting],
     lines: Lines,
     pose: FloatArray,
     theta: FloatArray,
@@ -295,7 +295,7 @@ class LandmarkFactors:
 
     def sighting(
         self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, alone: LandmarkMeasurement | None = None
-    ) -> LandmarkFactor:
+    ) -> LoggedSighting:
         """The measurement as the graph takes it at keyframe k.
 
         Raises:
@@ -303,14 +303,14 @@ class LandmarkFactors:
             CovarianceError: the measurement's covariance is not one.
         """
         if self._known is None:
-            return LandmarkFactor(m, alone or m, cauchy_k, factors=(self._unknown(k, m, cauchy_k),))
+            return LoggedSighting(m, alone or m, cauchy_k, self._unknown(k, m, cauchy_k))
         if m.of_landmark and m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
         if m.cov is not None and (problem := covariance_problem(m.cov)):
             raise CovarianceError(
                 f"{problem}: {m.cov.tolist()}; a measurement like this has to be rejected by the gate"
             )
-        return LandmarkFactor(m, alone or m, cauchy_k)
+        return LoggedSighting(m, alone or m, cauchy_k)
 
     def observe(self, measurements: Sequence[LandmarkMeasurement]) -> Observations:
         """Sightings of the known map, prepared for being linearized; of the same as the last time, once."""

@@ -28,16 +28,17 @@ class PoseWithCovariance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LandmarkFactor:
-    """A landmark measurement as the graph takes it: motion-compensated to its keyframe, with kernel and factors.
+class LoggedSighting:
+    """A landmark measurement as the graph takes it: motion-compensated to its keyframe, with kernel and factor.
 
-    Factors are immutable and may be held by any number of graphs.
+    A factor is immutable and may be held by any number of graphs. On a known map there is none: the sightings of a
+    keyframe become one factor together (`fgloc.graph.factors.sighting_factors`).
     """
 
     measurement: LandmarkMeasurement
     alone: LandmarkMeasurement  # before sightings near in time shared their information
     cauchy_k: float | None
-    factors: tuple[gtsam.NonlinearFactor, ...] = ()  # of a landmark that is a variable
+    factor: gtsam.NonlinearFactor | None = None  # of a landmark that is a variable
 
 
 @dataclass(slots=True, eq=False)
@@ -50,8 +51,8 @@ class Keyframe:
     belief: PoseWithCovariance  # filtered; factors are linear about it, and a rebuilt window or the batch start there
     prior: PoseWithCovariance | None = None  # first keyframe of a segment
     motions: tuple[MotionMeasurement, ...] = ()
-    sightings: tuple[LandmarkFactor, ...] = ()
-    rejected: tuple[LandmarkFactor, ...] = ()  # rejected online; for the cost of the batch
+    sightings: tuple[LoggedSighting, ...] = ()
+    rejected: tuple[LoggedSighting, ...] = ()  # rejected online; for the cost of the batch
     step: Step | None = None  # its events, to be measured again
     mode: Mode = Mode.OK
     readings: MotionReadings = field(default_factory=MotionReadings)  # what the motions were made of ...

@@ -97,7 +97,7 @@ def test_unknown_landmark_factors_have_zero_residual_at_truth(pose):
     point = point_sighting(pose, landmarks.landmarks[9], np.diag([1e-4, 1e-2]))
     marker = FrameMeasurement(0, 0, se2.between(pose, landmarks.landmarks[0].planar), np.eye(3))
     for m in (point, marker):
-        (factor,) = factors.sighting(0, m, None).factors
+        factor = factors.sighting(0, m, None).factor
         assert factor.error(values) == pytest.approx(0.0, abs=1e-12)
 
 
