@@ -13,6 +13,7 @@ from fgloc.calibration.installation import found_text, settings_found, with_sett
 from fgloc.calibration.truth import calibrate_by_truth
 from fgloc.config import Config, base_role, base_roles
 from fgloc.errors import EstimatorError
+from fgloc.extensions import outside_sensors
 from fgloc.recording.reader import open_recording
 from fgloc.recording.storage import find_beside
 from fgloc.replay import Progress
@@ -63,7 +64,7 @@ def calibrate(
 def only_truth(bag: Path, config: Config) -> bool:
     """Whether nothing but a truth tells where the robot was."""
     with open_recording(bag, config.recording) as recording:
-        seeing = {"image", "sightings", *(s.role for sensor in registry.sensors() for s in sensor.streams)}
+        seeing = {"image", "sightings", *(s.role for sensor in outside_sensors() for s in sensor.streams)}
         return "truth" in recording.roles and not seeing & base_roles(recording.roles)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from fgloc.config import CAMERA_ROLES, Config, Role, base_roles, camera_role
 from fgloc.errors import CameraError, ConfigError, RecordingError
+from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, rpy_matrix
 from fgloc.recording.reader import Recording
 from fgloc.recording.transforms import FrameTree
@@ -327,7 +328,7 @@ def _sensors(facts: StreamFacts, config: Config, landmark_map: LandmarkMap | Non
     """Those registered sensors that have settings and a topic in this stream."""
     contexts = {
         sensor.name: Context(config, getattr(config, sensor.name), facts.roles, landmark_map, _frames(facts, config))
-        for sensor in registry.sensors()
+        for sensor in outside_sensors()
         if hasattr(config, sensor.name) and any(stream.role in facts.roles for stream in sensor.streams)
     }
     return registry.build(contexts)

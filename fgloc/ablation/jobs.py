@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import re
 import resource
 import sys
 import tempfile
@@ -39,8 +38,6 @@ from fgloc.sensors.markers.images import ImageError, ImageEvent
 from fgloc.types import Mode, TruthEvent
 
 # --- Records, written whole or not at all, and a line for every attempt -----------------------------------------------
-
-_ATTEMPT = re.compile(r"(\w+) (\d+\.\d{6})")
 
 
 class Track(BaseModel):
@@ -104,13 +101,6 @@ def write_record(out: Path, record: Record) -> None:
         OutputError: it cannot be written.
     """
     write_json(record_path(out, record.key), record.model_dump(mode="json"))
-
-
-def attempts(out: Path) -> list[tuple[str, float]]:
-    """Key and time [s since 1970] of every run that was begun, in order, without lines that a full disk cut short."""
-    path = out / "jobs" / "attempts.log"
-    lines = path.read_text(encoding="ascii", errors="replace").splitlines() if path.exists() else []
-    return [(match[1], float(match[2])) for match in map(_ATTEMPT.fullmatch, lines) if match]
 
 
 def log_attempt(out: Path, key: str) -> None:

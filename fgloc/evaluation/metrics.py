@@ -306,7 +306,6 @@ def _turned(config: Config, matched: Matched) -> Finding | None:
 
 
 _TURNED_RAD = 0.1  # yaw of a truth that is worth a word
-_NO_YAW_RAD = 1e-3  # turn of a truth that has none
 _AGREE = 0.25  # largest error of positions over the path's extent, and spread of the yaw over what it is off by
 
 

@@ -23,7 +23,7 @@ def planar_yaw(R_base_marker: FloatArray, landmark: Landmark | None) -> float:
     return math.atan2(axis[1], axis[0])
 
 
-MIN_RANGE_M = 1e-3
+_MIN_RANGE_M = 1e-3
 _S = TypeVar("_S", bound=Sighting)
 
 
@@ -68,6 +68,15 @@ class SightingContext:
         name = "" if self.camera is None else self.camera.name
         self.rejections[f"{camera_role(name, 'sightings')}.{reason}"] += count
 
+    def distance(self, range_m: float) -> float | None:
+        """Distance [m] of a reported range, as the settings calibrate it; None: it is none, which is counted."""
+        section = self.config.landmarks
+        distance = section.range_scale * (range_m - section.range_bias_m)
+        if distance < _MIN_RANGE_M:
+            self.reject("range")
+            return None
+        return distance
+
     def range_bearing_cov(self, distance: float) -> FloatArray:
         """Covariance ``(2, 2)`` of range [m] and bearing [rad] at a distance [m], as configured."""
         section = self.config.landmarks
@@ -76,7 +85,7 @@ class SightingContext:
 
     def polar(self, stamp_ns: int, landmark_id: int, place: FloatArray, cov_xy: FloatArray) -> PointMeasurement | None:
         """Range and bearing from the base of a place ``(2,)`` in the base frame with covariance ``(2, 2)``."""
-        if math.hypot(float(place[0]), float(place[1])) < MIN_RANGE_M:
+        if math.hypot(float(place[0]), float(place[1])) < _MIN_RANGE_M:
             self.reject("range")
             return None
         return PointMeasurement.of_point(stamp_ns, landmark_id, place, cov_xy, self.config.landmarks.cauchy_k)

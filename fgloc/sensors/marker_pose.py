@@ -167,9 +167,6 @@ def validator(checks: FieldChecks) -> Callable[[MarkerPosesEvent], Event | str]:
     return lambda event: checks.sift(event, judge)
 
 
-_MIN_RANGE_M = 1e-3
-
-
 class MarkerPoseMeasurer:
     """Planar poses of markers; range and bearing only if ``landmarks.yaw_sigma_rad`` is not set."""
 
@@ -184,9 +181,8 @@ class MarkerPoseMeasurer:
     def _marker_pose(self, stamp_ns: int, seen: MarkerPose) -> LandmarkSighting | None:
         section = self._context.config.landmarks
         arm = self._context.T_base_sensor[:3, :3] @ seen.position  # from the sensor, in the base's axes
-        distance = section.range_scale * (math.hypot(arm[0], arm[1]) - section.range_bias_m)
-        if distance < _MIN_RANGE_M:
-            self._context.reject("range")
+        distance = self._context.distance(math.hypot(arm[0], arm[1]))
+        if distance is None:
             return None
         bearing = math.atan2(arm[1], arm[0]) - section.bearing_bias_rad
         c, s = math.cos(bearing), math.sin(bearing)

@@ -92,7 +92,6 @@ class RangeBearingInput(EventInput):
         self._deliver(RangeBearingEvent(*self._when("sightings", stamp_ns), frame_id, found))
 
 
-_MIN_RANGE_M = 1e-3
 _MIN_COS_ALONG_AXIS = math.cos(math.radians(80.0))  # beyond it a distance along the axis says nothing of the range
 
 
@@ -109,11 +108,10 @@ class RangeBearingMeasurer:
 
     def _range_bearing(self, stamp_ns: int, seen: RangeBearing) -> PointMeasurement | None:
         section = self._context.config.landmarks
-        distance = section.range_scale * (seen.range_m - section.range_bias_m)
-        bearing = seen.bearing_rad - section.bearing_bias_rad
-        if distance < _MIN_RANGE_M:
-            self._context.reject("range")
+        distance = self._context.distance(seen.range_m)
+        if distance is None:
             return None
+        bearing = seen.bearing_rad - section.bearing_bias_rad
         c, s = math.cos(bearing), math.sin(bearing)
         if section.range_along_axis:
             if c < _MIN_COS_ALONG_AXIS:

@@ -57,18 +57,9 @@ BUILT_IN: tuple[BuiltIn, ...] = (
 MOTION_INSTALLATIONS = tuple(sensor.installation for sensor in BUILT_IN if sensor.installation is not None)
 
 
-def sensors() -> tuple[type[Sensor], ...]:
-    """The sensors of installed packages.
-
-    Raises:
-        ConfigError: one cannot be used.
-    """
-    return outside_sensors()
-
-
 def streams() -> tuple[Stream, ...]:
     """Streams of all sensors, the built-in ones first."""
-    return _streams(sensors())
+    return _streams(outside_sensors())
 
 
 @cache
@@ -100,7 +91,7 @@ def usual_names(role: str) -> tuple[str, ...]:
 
 def role_of_event(event: Event) -> str | None:
     """Role of a sensor's event; None if no sensor has it."""
-    return _role_by_class(sensors()).get(type(event))
+    return _role_by_class(outside_sensors()).get(type(event))
 
 
 def events_by_sensor() -> dict[str, tuple[type[Event], ...]]:
@@ -109,7 +100,7 @@ def events_by_sensor() -> dict[str, tuple[type[Event], ...]]:
     for sensor in BUILT_IN:
         name = sensor.failing_as or sensor.name
         found[name] = (*found.get(name, ()), *(stream.event for stream in sensor.streams))
-    return found | {s.name: tuple(stream.event for stream in s.streams) for s in sensors()}
+    return found | {s.name: tuple(stream.event for stream in s.streams) for s in outside_sensors()}
 
 
 def _known_sensor(name: str) -> str:
@@ -134,9 +125,8 @@ def events_of(sensor: str) -> tuple[type[Event], ...]:
 
 def failures() -> tuple[type[Section], ...]:
     """Failures of all sensors."""
-    return tuple(
-        failure for own in (*(s.failures for s in BUILT_IN), *(s.failures for s in sensors())) for failure in own
-    )
+    sensors: tuple[BuiltIn | type[Sensor], ...] = (*BUILT_IN, *outside_sensors())
+    return tuple(failure for sensor in sensors for failure in sensor.failures)
 
 
 def carried(carriage: Carriage) -> dict[type[Event], Callable[[Event], Event]]:
@@ -161,7 +151,7 @@ def motion_parameters(config: Config, sources: Collection[str]) -> tuple[Paramet
 
 def found_rows(config: Config) -> Iterator[FoundRow]:
     """Rows of ``metrics.json`` that parameters of the sensors of installed packages make."""
-    for sensor in sensors():
+    for sensor in outside_sensors():
         rows = getattr(sensor, "found", ())
         section = getattr(config, sensor.name, None)
         yield from (() if section is None else rows(section)) if callable(rows) else rows
@@ -200,5 +190,5 @@ def joiner_of(event: Event) -> Callable[[], Joiner] | None:
 
 def build(context_of: Mapping[str, Context]) -> tuple[Sensor, ...]:
     """The sensors of installed packages for one run, of those that have a context."""
-    built = (s.build(context_of[s.name]) for s in sensors() if s.name in context_of)
+    built = (s.build(context_of[s.name]) for s in outside_sensors() if s.name in context_of)
     return tuple(sensor for sensor in built if sensor is not None)

@@ -14,9 +14,10 @@ import numpy as np
 import psutil
 import pytest
 import yaml
+from attempts import attempts
 
 from fgloc import se2
-from fgloc.ablation.jobs import attempts, execute, make_jobs, read_record, record_path
+from fgloc.ablation.jobs import execute, make_jobs, read_record, record_path
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.ablation.sweep import _client, sweep
 from fgloc.errors import ConfigError
@@ -157,7 +158,7 @@ def test_fault_70_killed_sweep_resumes_and_runs_nothing_twice(folder, swept, tmp
     records = sweep(jobs_of(folder), tmp_path, workers=2)
     assert {k: comparable(r) for k, r in records.items()} == {k: comparable(r) for k, r in undisturbed.items()}
     assert all(path.stat().st_mtime_ns == before for path, before in finished.items())
-    started = [key for key, _ in attempts(tmp_path)]
+    started = attempts(tmp_path)
     assert all(started.count(path.stem) == 1 for path in finished)
 
 
@@ -185,7 +186,7 @@ def test_job_that_kills_its_workers_is_quarantined_and_the_others_finish(folder,
 
     def kill_whenever_it_begins():
         while not over.is_set():
-            begun = [key for key, _ in attempts(out)].count(poison)
+            begun = attempts(out).count(poison)
             if begun > len(kills):
                 workers = [c for c in psutil.Process().children(True) if any("spawn_main" in a for a in c.cmdline())]
                 kills.append(len(workers))

@@ -4,9 +4,10 @@ import json
 import shutil
 
 import pytest
+from attempts import attempts
 from test_cli import FILES, fgloc, refused, write_circle
 
-from fgloc.ablation.jobs import attempts, execute
+from fgloc.ablation.jobs import execute
 from fgloc.ablation.sweep import folder_names, plan_bags
 from fgloc.config import Config, config_of, load_config
 from fgloc.errors import ConfigError

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fgloc.config import MarkersConfig
 from fgloc.sensors.markers.detector import MarkerDetector
-from fgloc.sensors.markers.edges import refine_corners
+from fgloc.sensors.markers.edges import refine_all
 from fgloc.types import FloatArray
 
 CAMERA = forward_camera()
@@ -46,17 +46,17 @@ def test_a_guess_that_is_a_pixel_off_is_corrected() -> None:
     rng = np.random.default_rng(4)
     for _ in range(5):
         image, truth = scene(rng, 2.0, 0.7)
-        refined = refine_corners(image, truth + rng.uniform(-1.0, 1.0, (4, 2)), cells=6)
+        refined = refine_all(image, truth[None] + rng.uniform(-1.0, 1.0, (1, 4, 2)), cells=6)[0]
         assert np.abs(refined - truth).max() < 0.2
 
 
 def test_unclear_edges_leave_the_guess_as_it_is() -> None:
     guess = np.array([[50.0, 50.0], [90.0, 50.0], [90.0, 90.0], [50.0, 90.0]])
     plain = np.full((200, 200), 90, np.uint8)
-    assert np.array_equal(refine_corners(plain, guess, 6), guess)
-    assert np.array_equal(refine_corners(plain, guess * 0.01, 6), guess * 0.01)
+    assert np.array_equal(refine_all(plain, guess[None], 6)[0], guess)
+    assert np.array_equal(refine_all(plain, guess[None] * 0.01, 6)[0], guess * 0.01)
     far = plain.copy()
     cv2.rectangle(far, (60, 60), (100, 100), 0, -1)  # the nearest edges are of something else
-    assert np.abs(refine_corners(far, guess, 6) - guess).max() <= 2.5
+    assert np.abs(refine_all(far, guess[None], 6)[0] - guess).max() <= 2.5
     at_the_rim = guess - 60.0
-    assert np.isfinite(refine_corners(far, at_the_rim, 6)).all()
+    assert np.isfinite(refine_all(far, at_the_rim[None], 6)).all()

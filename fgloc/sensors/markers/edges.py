@@ -105,14 +105,6 @@ _SUM_AND_MOMENT = np.stack([np.ones(_ACROSS - 1), 0.5 * (_ACROSS_STEPS[1:] + _AC
 _POWERS = np.stack([np.ones(_ALONG), _ALONG_STEPS, _ALONG_STEPS**2], axis=1).astype(np.float32)
 
 
-def refine_corners(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
-    """Corners ``(4, 2)`` where lines fitted to the marker's edges meet, or the given ones if the edges are unclear.
-
-    As `refine_all`, of one marker.
-    """
-    return np.asarray(refine_all(image, corners[None], cells)[0])
-
-
 def refine_all(image: GrayImage, corners: FloatArray, cells: int) -> FloatArray:
     """Corners ``(n, 4, 2)`` of several markers where lines fitted to the edges meet.
 
