@@ -854,7 +854,7 @@ def _has(config: Config, section: str, key: str) -> bool:
 
 
 def config_type() -> type[Config]:
-    """`Config` with a section for each sensor of another package, under its name."""
+    """`Config` with a section for each sensor by entry point, under its name."""
     return _with_sensors(outside_sensors())
 
 

@@ -1,4 +1,4 @@
-"""Decisions on the motion: rows of ``steps.csv``, and sentences for the user."""
+"""Rows of ``steps.csv`` on motion, places, mountings, modes and the clock, and sentences for the user."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """Motion that enters the graph: the sources are read, tested against each other, and combined to factors.
 
-Three things can be wrong with a motion, each with its own test: a source is faulty (`MotionFaultMonitor`), the robot
-is carried (`LiftMonitor`), or sightings agree on a place nearby that the motion did not lead to
-(`JudgedMotion.overruled`).
+Five things can be wrong with a motion, each with its own test: wheels or learned motion are faulty
+(`MotionFaultMonitor`), an odometry beside the wheels is (`OdometriesBeside`), dead reckoning is further off between
+fixes than it says (`ExcessDrift`), the robot is carried (`LiftMonitor`), or sightings agree on a place nearby that the
+motion did not lead to (`fgloc.estimation.sightings.Association.nearby_consensus`, then `JudgedMotion.overruled`).
 """
 
 from __future__ import annotations
@@ -157,7 +158,7 @@ class SteadyMotion:
 
 
 class MotionSources:
-    """Reads wheels, learned motion and gyro, and follows what is known of their drift."""
+    """Reads wheels, learned motion, gyro, inclination and odometries beside; follows what is known of their drift."""
 
     def __init__(self, config: Config, sensors: MotionSensors, factors: LandmarkFactors | None = None) -> None:
         """Set up for the sensors of a run.
@@ -792,7 +793,7 @@ class JudgedMotion:
         return replace(self, factors=tuple(budget.overruled(m) for m in self.factors), budget=budget)
 
     def decisions(self, k: int) -> list[Decision]:
-        """Rows of ``steps.csv``, with those of earlier steps first."""
+        """Rows of ``steps.csv`` for this step; those of earlier ones are `revisions`."""
         return motion_decisions(k, self.factors, self.readings, self.budget, self.nis, self.threshold)
 
 

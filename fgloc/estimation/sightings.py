@@ -390,7 +390,7 @@ class JudgedSightings:
         accepted: to be fused.
         rejected: not to be fused.
         logged: those of them that the batch smoother and the landmark modes may know of.
-        decisions: rows of ``steps.csv``, one per sighting.
+        decisions: rows of ``steps.csv``, one per sighting; of a misread marker two, by either id.
         places: rows for places that sightings tell beside the predicted one.
         predicted: the pose that they were held against.
         lines: the accepted ones linearized there; None: there is none, or that pose is too uncertain for it to hold.
@@ -447,7 +447,7 @@ class SightingJudge:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences for the user about moved landmarks."""
+        """Sentences for the user about moved landmarks and knocked sensors."""
         return (*moved_notes(self.modes.displacements), *mounting_notes(self._remounted))
 
     @property

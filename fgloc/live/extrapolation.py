@@ -121,7 +121,8 @@ class Anchors:
         gyro, learned = localizer.motion.sources.gyro, self._run.learned
         body = se2.rotate_cov(estimate.cov, -float(estimate.pose[2]))
         same_time = frame is not None and frame.stamp_ns == estimate.stamp_ns
-        # Another pose is of the odometry that stands in for the estimate, see `fgloc.diagnosis.sanity`
+        # Another pose is of the odometry that stands in for the estimate (`fgloc.diagnosis.sanity`), or in the frame of
+        # a map that was moved (`fgloc.estimation.localizer.MapFrame`)
         if frame is not None and same_time and np.array_equal(frame.belief.pose, estimate.pose):
             belief = frame.belief
             known = belief.installation or installation.estimated

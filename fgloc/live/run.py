@@ -1,4 +1,4 @@
-"""A live run without its threads: events in order of receipt go in, estimates come out, as `fgloc.runner` has it."""
+"""A live run without its threads: events in order of receipt go in, estimates come out (recorded: `Replay`)."""
 
 from __future__ import annotations
 

@@ -91,9 +91,9 @@ def path(stamps_ns: Iterable[int], poses: Iterable[FloatArray], stamp_ns: int) -
 def diagnostics(
     stamp_ns: int, mode: Mode | None, message: str, values: Mapping[str, str], wrong: bool = False, name: str = "fgloc"
 ) -> Message:
-    """diagnostic_msgs/DiagnosticArray; ``mode`` None: there is no pose yet; ``wrong``: it is not to be trusted.
+    """diagnostic_msgs/DiagnosticArray; ``wrong``: the pose is not to be trusted.
 
-    ``name`` is that of the node.
+    ``mode`` None: there is no pose yet, or none of now. ``name`` is that of the node.
     """
     status = {
         "level": _LEVEL[Mode.LOST] if wrong else STALE if mode is None else _LEVEL[mode],

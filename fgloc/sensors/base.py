@@ -375,7 +375,7 @@ class MotionInstallation:
 
 @dataclass(frozen=True, slots=True)
 class BuiltIn:
-    """Description of a sensor of fgloc itself: the counterpart of `Sensor`, which those of other packages implement.
+    """Description of a built-in sensor: the counterpart of `Sensor`, which those by entry point implement.
 
     Attributes:
         name: of its rows in ``steps.csv``, and in the counts.
@@ -439,6 +439,11 @@ class Sensor(Protocol):
     `Parameter` for each, named ``sensor.constant``, with the sigma of its prior about 0; a tuple ``found`` of
     `FoundRow`, or a function of the section that makes one, brings them into ``metrics.json``. ``first_settings``
     (`FirstSettings`) is its part of ``fgloc init``.
+
+    Further class attributes that a sensor may have: ``needs``, the key of its section without which it is not built;
+    ``optional``, topics get its roles only where that is given, as most of their type hold nothing for it;
+    ``purpose``, what one gives it for, as a sentence of ``fgloc info`` says it (with ``optional``); ``uses_map``: it
+    has ``needs``, but no places of its own.
     """
 
     name: ClassVar[str]

@@ -78,7 +78,7 @@ class SightingContext:
         return distance
 
     def range_bearing_cov(self, distance: float) -> FloatArray:
-        """Covariance ``(2, 2)`` of range [m] and bearing [rad] at a distance [m], as configured."""
+        """Covariance ``(2, 2)`` of range [m] and bearing [rad], in this order, at a distance [m], as configured."""
         section = self.config.landmarks
         sigma = section.range_sigma_m + section.range_sigma_per_m * distance
         return np.diag([sigma**2, section.bearing_sigma_rad**2])

@@ -392,6 +392,7 @@ class PixelMeasurement(_OfLandmark):
 class PointMeasurement(_InPlane):
     """A landmark as a point: direction and distance from the base (the sensor's offset is already taken out).
 
+    Its covariance is of bearing and range, in this order (GTSAM's); `SightingContext.range_bearing_cov` has the other.
     With the id `UNNAMED` it is of any point of the map: which one the predicted pose tells.
     """
 
@@ -405,7 +406,7 @@ class PointMeasurement(_InPlane):
     landmark_id: int
     range_m: float
     bearing_rad: float
-    cov: FloatArray  # (2, 2), order bearing, range (GTSAM's)
+    cov: FloatArray  # (2, 2), order bearing, range
     twist: FloatArray = field(default_factory=lambda: _AT_REST)  # as in PixelMeasurement
     offset_s: float = 0.0
     cauchy_k: float = 3.0  # as in PixelMeasurement

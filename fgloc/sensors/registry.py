@@ -1,4 +1,4 @@
-"""All sensors, the built-in ones and those of installed packages, by role and by event."""
+"""All sensors, the built-in ones and those by entry point, by role and by event."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def motion_parameters(config: Config, sources: Collection[str]) -> tuple[Paramet
 
 
 def found_rows(config: Config) -> Iterator[FoundRow]:
-    """Rows of ``metrics.json`` that parameters of the sensors of installed packages make."""
+    """Rows of ``metrics.json`` that parameters of the sensors by entry point make."""
     for sensor in outside_sensors():
         rows = getattr(sensor, "found", ())
         section = getattr(config, sensor.name, None)
@@ -189,6 +189,6 @@ def joiner_of(event: Event) -> Callable[[], Joiner] | None:
 
 
 def build(context_of: Mapping[str, Context]) -> tuple[Sensor, ...]:
-    """The sensors of installed packages for one run, of those that have a context."""
+    """The sensors by entry point for one run, of those that have a context."""
     built = (s.build(context_of[s.name]) for s in outside_sensors() if s.name in context_of)
     return tuple(sensor for sensor in built if sensor is not None)
