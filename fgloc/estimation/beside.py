@@ -87,17 +87,13 @@ class OdometriesBeside:
 
     def read(self, step: Step) -> tuple[MotionMeasurement, ...]:
         """Motion of each source that has been compared long enough, with its estimated covariance and constants."""
-        known, index = self._factors.estimated.mean, self._factors.installation.index
         self._readings, used = {}, []
         for source in self._sources:
             reading = source.read(step)
             if reading is None:
                 continue
-            by = {name: d for name, d in source.derivatives(step, reading.motion).items() if name in index}
-            kept = {name: (d, float(known[index[name]])) for name, d in by.items()}
-            correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
-            motion = se2.compose(reading.motion.motion, se2.exp(correction))
-            reading = replace(reading, motion=replace(reading.motion, motion=motion, depends_on=kept))
+            motion = self._factors.installed(reading.motion, source.derivatives(step, reading.motion))
+            reading = replace(reading, motion=motion)
             self._readings[source.name] = reading
             if self._states[source.name].compared_s >= _LEARNED_S:
                 used.append(replace(reading.motion, cov=source.scale.factor * reading.motion.cov))

@@ -239,7 +239,7 @@ class MotionSources:
         reported = wheels = self._wheels.measure(step)
         if reported is not None:
             by = self._wheels.derivatives(step, reported, self.factors.installation.index)
-            wheels = self._installed(reported, by)
+            wheels = self.factors.installed(reported, by)
         motion = np.zeros(3) if wheels is None else wheels.motion
         gyro = self._turn = None
         if self.gyro is not None:
@@ -253,7 +253,7 @@ class MotionSources:
                 cov = np.diag([FAR_M2, FAR_M2, turn.variance])
                 name, turned = "gyro", with_yaw(motion, turn.yaw)
                 gyro = MotionMeasurement(name, step.start_ns, step.stamp_ns, turned, cov)
-                gyro = self._installed(gyro, self.gyro.derivatives(turned))
+                gyro = self.factors.installed(gyro, self.gyro.derivatives(turned))
                 self._turn = turn
                 if reported is not None and wheels is not None:
                     wheels = replace(wheels, depends_on=self._by_fused_turn(step, reported, turn, wheels.depends_on))
@@ -297,14 +297,6 @@ class MotionSources:
         drift = max(self._turn.variance - self._turn.noise, 0.0)
         return replace(learned, cov=learned.cov + np.diag([0.0, 0.0, drift]))
 
-    def _installed(self, m: MotionMeasurement, *derivatives: Mapping[str, FloatArray]) -> MotionMeasurement:
-        """The motion as reported with the installation as it is known now; its derivatives are those of the sensors."""
-        index, mean = self.factors.installation.index, self.factors.estimated.mean
-        by = {name: d for each in derivatives for name, d in each.items()}
-        kept = {name: (d, float(mean[index[name]])) for name, d in by.items() if name in index}
-        correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
-        return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
-
     def _measure_learned(self, step: Step) -> MotionMeasurement | None:
         if self._learned is None:
             return None
@@ -313,7 +305,7 @@ class MotionSources:
             return None
         m, by = measured
         by_turn = [self.gyro.derivatives(m.motion)] if self.gyro and self._turn and self._learned_has_gyro else []
-        return self._installed(m, by, *by_turn)
+        return self.factors.installed(m, by, *by_turn)
 
     def unknown(
         self, step: Step, readings: MotionReadings | None = None, carried_s: float | None = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from operator import is_not
 from typing import Any
 
@@ -292,6 +293,14 @@ class LandmarkFactors:
     def landmarks(self) -> Mapping[int, Landmark]:
         """Landmarks of the known map, by id; empty if the map is unknown."""
         return self._known or {}
+
+    def installed(self, m: MotionMeasurement, *derivatives: Mapping[str, FloatArray]) -> MotionMeasurement:
+        """The motion as reported with the installation as it is known now; its derivatives are those of the sensors."""
+        index, mean = self.installation.index, self.estimated.mean
+        by = {name: d for each in derivatives for name, d in each.items()}
+        kept = {name: (d, float(mean[index[name]])) for name, d in by.items() if name in index}
+        correction = np.sum([d * value for d, value in kept.values()], axis=0) if kept else np.zeros(3)
+        return replace(m, motion=se2.compose(m.motion, se2.exp(correction)), depends_on=kept)
 
     def sighting(
         self, k: int, m: LandmarkMeasurement, cauchy_k: float | None, alone: LandmarkMeasurement | None = None
