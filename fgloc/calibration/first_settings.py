@@ -16,6 +16,7 @@ from fgloc.config import (
     CAMERA_ROLES,
     Config,
     Role,
+    base_roles,
     camera_role,
     config_of,
     config_of_file,
@@ -59,6 +60,7 @@ _CORNERS = frozenset(
     if issubclass(stream.event, SightingsEvent) and stream.event.in_pixels
     for kind in stream.converters
 )
+_RANGE_BEARING = "landmark_msgs/msg/LandmarkArray"  # of any sensor
 _CORRELATED_S = 1.0  # views from about one place err alike, for longer than the scatter over seconds shows
 _COMMANDED = (
     "  # Commands stand in for wheels. A robot follows them by a share that nobody has measured (5 to 12 % less is",
@@ -152,7 +154,7 @@ def first_settings(bag: Path, ask: Ask | None = None) -> RobotFile:
     compared = None if seen.info.problems else _compared(bag, text)
     found = () if compared is None else ordered(compared.findings)
     text = with_findings(text, found)
-    if compared is not None and "sightings" in seen.info.roles:
+    if compared is not None and "sightings" in base_roles(seen.info.roles):
         text = _with_lines(text, _noise_lines(compared.noise, seen.has_map))
     if compared is not None and compared.commanded:
         text = _with_lines(text, {"wheels": _COMMANDED, "expert.wheels": _COMMANDED_EXPERT})
@@ -337,12 +339,14 @@ def _others(bag: Path, config: Config) -> dict[Role, tuple[str, ...]]:
 
 
 def _with_cameras(bag: Path, config: Config) -> Config:
-    """The configuration with a section for each camera, where several topics have images, or corners of markers."""
+    """The configuration with a section for each camera, where several topics have images, or markers found in them."""
     with Recording(bag, config.recording) as recording:
         if {"image", "sightings"} & recording.roles.keys():
             return config
         topics = [t for t in recording.topics if t.count]
-    for role, kinds in (("image", _IMAGES), ("sightings", _CORNERS)):
+    # Poses of markers in messages of two types may be of one camera, those of one type are not.
+    of_poses = [frozenset({kind}) for kind in converters_of("sightings") if kind not in {*_CORNERS, _RANGE_BEARING}]
+    for role, kinds in (("image", _IMAGES), *(("sightings", kinds) for kinds in (_CORNERS, *of_poses))):
         there = [t.name for t in topics if t.message_type in kinds and not is_derived(t.name)]
         plain = [name for name in there if name.removesuffix("/compressed") not in there or "/compressed" not in name]
         if len(plain) > 1:

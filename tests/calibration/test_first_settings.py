@@ -97,3 +97,21 @@ def test_positions_without_a_fix_are_named_and_not_used(tmp_path):
     assert len(named) == len(usual) + 1
     assert any("7 of 100" in text for text in named)
     assert any(origin in text for text in named)
+
+
+def test_poses_of_markers_on_two_topics_are_of_two_cameras(tmp_path):
+    facing = (0.5, -0.5, -0.5, 0.5)
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(60):
+            stamp = START_NS + k * 50_000_000
+            bag.odometry("/odom", stamp, (0.02 * k, 0.0, 0.0), (0.4, 0.0))
+            for i, side in enumerate(("front", "rear")):
+                bag.marker_poses(f"/{side}/markers", stamp + i, [(i, (0.0, 0.0, 3.0), facing, None)], frame_id=side)
+    write_map(LandmarkMap({0: Landmark(0, np.array([4.0, 0.0, 0.5]), np.eye(3), 0.2)}), tmp_path / "map.yaml")
+    config = config_of_file(yaml.safe_load(first_settings(tmp_path / "bag").text))
+    assert {name: camera.sightings for name, camera in config.cameras.items()} == {
+        "front": "/front/markers",
+        "rear": "/rear/markers",
+    }
+    assert config.landmarks.repeat_s > 0.0
+    assert config.landmarks.position_sigma_m > Config().landmarks.position_sigma_m
