@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
@@ -16,6 +17,7 @@ from pydantic import (
     PrivateAttr,
     StringConstraints,
     create_model,
+    field_validator,
     model_validator,
 )
 
@@ -661,6 +663,16 @@ class EstimatorConfig(Section):
     motion_kernel: Literal["none", "huber", "cauchy", "dcs"] = expert(
         "none", description="robust kernel on the wheels, online; for comparison"
     )
+
+    @field_validator("initial_pose")
+    @classmethod
+    def _is_in_radians(cls, pose: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if pose is not None and abs(pose[2]) > math.tau + 0.01:
+            raise ValueError(
+                f"the yaw of {pose[2]:g} is more than a turn; expected radians ({pose[2]:g}° are "
+                f"{math.radians(pose[2]):.4f})"
+            )
+        return pose
 
 
 class Distrust(Section):

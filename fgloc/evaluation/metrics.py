@@ -279,7 +279,8 @@ def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | N
     """Finding that the truth is not in the frame of a run without a map: of its first pose, of anchors or positions."""
     at_origin = np.allclose(result.trajectory.poses[0], 0.0, atol=_ORIGIN)
     placed = result.landmarks is not None and not len(result.landmarks)  # by anchors or positions
-    if config.estimator.initial_pose is not None or not (at_origin or placed):
+    nowhere = any(finding.code == "map.unused" for finding in result.findings)  # poses are not in the map's frame
+    if nowhere or config.estimator.initial_pose is not None or not (at_origin or placed):
         return None
     times = (matched.stamps_ns - matched.stamps_ns[0]) * 1e-9
     sentence = truth_sentence(config, np.column_stack([times, matched.truth]), times, matched.estimate)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -16,7 +17,7 @@ from fgloc.config import BUILT_IN_ROLES, Config, Role, base_role, base_roles
 from fgloc.errors import RecordingError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.reader import HEADERLESS, TF_TYPES, Recording, TopicInfo, converters_of
+from fgloc.recording.reader import CONVERTERS, HEADERLESS, TF_TYPES, Recording, TopicInfo, converters_of
 from fgloc.sensors import registry
 from fgloc.sensors.checks import (
     Collector,
@@ -102,8 +103,9 @@ def _received(
 def _stamped(
     report: TopicReport, role: Role, times: Times, start_ns: int, config: Config
 ) -> tuple[TopicReport, list[str]]:
-    """Header stamps against receive times; and what is wrong with them."""
-    stamps, received = int64(times.stamps), int64(times.decoded)
+    """Header stamps, as they are recorded, against receive times; and what is wrong with them."""
+    configured_ns = round(config.recording.stamp_offset_s.get(role, 0.0) * 1e9)
+    stamps, received = int64(times.stamps) - configured_ns, int64(times.decoded)
     zero = stamps == 0
     steps = np.diff(stamps[~zero]) * 1e-9
     delays = (received - stamps)[~zero] * 1e-9
@@ -388,7 +390,8 @@ def _roles(
         text = f"No odometry, joint states or commands: {told} how the robot moves."
         yield Finding(motion, text + _perhaps_odometry(recording), Severity.WARNING)
     if not unsettled and not placing_roles(roles, config):
-        yield Finding(place, "No images and no marker sightings: nothing bounds the drift.", Severity.WARNING)
+        text = "No images and no marker sightings: nothing bounds the drift." + _perhaps_sightings(recording)
+        yield Finding(place, text, Severity.WARNING)
     images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
     info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)
     sightings = next((c for c in checks.values() if isinstance(c, SightingsChecks)), None)
@@ -420,6 +423,26 @@ def _perhaps_odometry(recording: Recording) -> str:
     return f" If {' or '.join(fitting)} is an odometry of the robot, set recording.topics.odometry: {fitting[0]}."
 
 
+_OF_MARKERS = re.compile(r"(?<![a-z])(aruco|april_?tag|tag|fiducial|marker)s?(?![a-z])", re.IGNORECASE)
+
+
+def _perhaps_sightings(recording: Recording) -> str:
+    """Sentence on what seems to tell of markers in a form that is not read; empty: nothing does."""
+    found = [
+        f"{topic.name} ({topic.message_type.replace('/msg/', '/')})"
+        for topic in recording.topics
+        if topic.role is None and topic.count and topic.message_type in _DRAWN and _OF_MARKERS.search(topic.name)
+    ]
+    frames = [name for name in recording.frames.frames if _OF_MARKERS.search(name)]
+    found += [f"the frames {', '.join(frames[:3])}{', ...' if len(frames) > 3 else ''} in tf"] if frames else []
+    if not found:
+        return ""
+    return f" Not read: {' and '.join(found)}; record the detector's own messages (the types are in docs/formats.md)."
+
+
+_DRAWN = frozenset({"visualization_msgs/msg/MarkerArray", "visualization_msgs/msg/Marker", *CONVERTERS["truth"]})
+
+
 def unread_map(recording: Recording, config: Config) -> str | None:
     """Sentence on a map that is given while nothing of the recording is read that sees landmarks; None: something is.
 
@@ -429,7 +452,7 @@ def unread_map(recording: Recording, config: Config) -> str | None:
     """
     if placing_roles(recording.roles, config):
         return None
-    unread = " ".join(_unused(recording, config))
+    unread = " ".join([*_unused(recording, config), _perhaps_sightings(recording).strip()]).strip()
     return (
         "A map is given, but the recording has no images and no sightings that are read: the run is dead reckoning, "
         f"and where on the map it takes place is not known.{' ' + unread if unread else ''} Run it without the map, or "

@@ -158,6 +158,10 @@ _NOT_TRUTH = re.compile(
     r"combined|aruco|markers?|(april)?tags?|detections?|odom)(?![a-z])",
     re.IGNORECASE,
 )
+_NO_BASE = re.compile(  # poses that are not the robot's, whatever a user may want them for
+    r"(?<![a-z])(goal|target|setpoint|clicked|plan|waypoint|aruco|markers?|(april)?tags?|detections?)(?![a-z])",
+    re.IGNORECASE,
+)
 _NOT_IMAGE = re.compile(
     r"(?<![a-z])((compressed)?depth|disparity|confidence|mask|debug|result|overlay|rect(ified)?|costmap)(?![a-z])",
     re.IGNORECASE,
@@ -290,7 +294,13 @@ def _unnamed(role: Role, filled: Iterable[TopicInfo]) -> str:
     if role not in ("image", "truth"):
         return ""
     fitting = converters_of(role).keys() - {_ODOMETRY}
-    by_type = [t.name for t in filled if t.message_type in fitting and not t.name.startswith(OWN)]
+    by_type = [
+        t.name
+        for t in filled
+        if t.message_type in fitting
+        and not t.name.startswith(OWN)
+        and not (role == "truth" and _NO_BASE.search(t.name))
+    ]
     if not by_type:
         return ""
     return (

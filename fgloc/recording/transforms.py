@@ -84,7 +84,8 @@ class FrameTree:
             if edge.moves:
                 raise RecordingError(
                     f"no fixed transform from {parent!r} to {child!r}: {b!r} moves against {a!r} during the recording; "
-                    f"{_REMEDY}"
+                    f"a sensor has to be fixed to the base, and what it sees to be in its own frame: tell a detector "
+                    f"so that gives it in {child!r} (aruco_ros: reference_frame)"
                 )
             T = T @ (edge.T if (a, b) in self._edges else np.linalg.inv(edge.T))
         return T

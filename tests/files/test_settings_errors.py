@@ -15,6 +15,7 @@ from fgloc.errors import ConfigError
         ("recording: {sightings_pose: [1, 2, 3, 4, 5, 6, 7]}", "recording.sightings_pose", "6 numbers"),
         ("recording: {sightings_pose: 1}", "recording.sightings_pose", "6 numbers"),
         ("estimator: {initial_pose: {x: 1}}", "estimator.initial_pose", "3 numbers"),
+        ("estimator: {initial_pose: [1, 2, 90]}", "estimator.initial_pose", "radians (90° are 1.5708)"),
         ("expert: {estimator: {initial_sigmas: [1]}}", "expert.estimator.initial_sigmas", "3 numbers"),
         ("cameras: {front: {image: /i, pose: [1, 2]}}", "cameras.front.pose", "6 numbers"),
         ("uwb: {anchors: {1: [1, 2]}}", "uwb.anchors.1", "3 numbers"),

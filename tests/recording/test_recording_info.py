@@ -54,6 +54,8 @@ def test_a_sound_recording_has_no_findings(tmp_path):
     assert info.findings == ()
     assert info.problems == info.notes == ()
     assert info.marker_ids == {0: 40, 1: 40}
+    corrected = config_of({"recording": {"stamp_offset_s": {"odometry": 0.1, "truth": 0.5}}})
+    assert inspect(tmp_path / "run", corrected).findings == ()  # header stamps are reported as they are recorded
     odometry = next(t for t in info.topics if t.used_as == "odometry")
     assert odometry.rate_hz == pytest.approx(20.0)
     assert odometry.longest_gap_s == pytest.approx(0.05)
@@ -267,3 +269,24 @@ def test_a_run_says_that_positions_are_not_used_where_nothing_else_places_it(tmp
     config = config_of({"estimator": {"initial_pose": [0, 0, 0]}} | ({"gnss": {"origin": origin}} if origin else {}))
     codes = [finding.code for finding in run(tmp_path / "run", None, config, "online").findings]
     assert ("positions.unused" in codes) == (origin is None and not beside)
+
+
+def test_markers_in_a_form_that_is_not_read_are_named(tmp_path):
+    quaternion = (0.0, 0.0, 0.0, 1.0)
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(50):
+            stamp = START_NS + k * TICK_NS
+            bag.odometry("/odom", stamp, (0.05 * k, 0.0, 0.0), (1.0, 0.0))
+            bag.static_transform(stamp, "camera", "tag36h11:5", (0.0, 0.0, 2.0), quaternion, topic="/tf")
+            bag.truth("/aruco_single/pose", stamp, (0.0, 0.0, 2.0), quaternion)
+    text = one(inspect(tmp_path / "run", CONFIG), "place.unbounded")
+    assert "tag36h11:5" in text
+    assert "/aruco_single/pose" in text
+
+
+def test_a_topic_that_may_be_an_odometry_is_named_where_nothing_else_measures_motion(tmp_path):
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(50):
+            bag.truth("/odom_pose", START_NS + k * TICK_NS, (0.05 * k, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            bag.range_bearing("/landmarks", START_NS + k * TICK_NS, [(1, 2.0, 0.1)])
+    assert "recording.topics.odometry: /odom_pose" in one(inspect(tmp_path / "run", CONFIG), "motion.unmeasured")
