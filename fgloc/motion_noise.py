@@ -113,7 +113,7 @@ def _most_likely(
         replay = replayed(recording, parts, "batch", progress, {"events": lambda events: _first(events, longest_s)})
     log = parts.localizer.estimator.log
     factors = of_whole_run(log, parts.localizer.factors)
-    if not replay.estimates or factors.installation.ground:
+    if not replay.estimates or factors.installation.ground or not parts.wheels.source:
         return None
     solver, _ = smoothed_within_priors(log, factors, config.batch, config.estimator.gate_probability)
     sound = [_is_sound(frame) for frame in solver.frames]

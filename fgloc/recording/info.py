@@ -418,6 +418,9 @@ def _perhaps_odometry(recording: Recording) -> str:
         for topic in recording.topics
         if topic.role is None and topic.count and topic.message_type in converters_of("odometry")
     ]
+    frames = [name for name in recording.frames.frames if "odom" in name.lower()]
+    if not fitting and frames:
+        return f" tf has the frame {frames[0]}, and poses in tf are not read: record the topic of the odometry."
     if not fitting:
         return ""
     return f" If {' or '.join(fitting)} is an odometry of the robot, set recording.topics.odometry: {fitting[0]}."

@@ -102,3 +102,17 @@ def test_init_writes_it_and_the_covariance_is_right_with_it(tmp_path):
 def test_noise_of_the_wheels_is_no_lag_and_no_mounting(tmp_path, made, seed):
     bag = record(tmp_path, made, made, seed)
     assert not [f.code for f in first_settings(bag).found]
+
+
+def test_wheels_whose_geometry_is_unknown_have_no_noise(tmp_path):
+    places = [(3.0, 3.0), (3.0, -2.0), (-2.0, 3.0), (-2.0, -2.0)]
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(400):
+            stamp, yaw = 1_700_000_000_000_000_000 + k * 50_000_000, 0.02 * k
+            x, y = math.sin(yaw), 1.0 - math.cos(yaw)
+            bag.joints("/joint_states", stamp, ["left_wheel", "right_wheel"], [0.3 * k, 0.5 * k])
+            seen = [(i, math.hypot(a - x, b - y), math.atan2(b - y, a - x) - yaw) for i, (a, b) in enumerate(places)]
+            bag.range_bearing("/landmarks", stamp, [(i, d, math.remainder(b, math.tau)) for i, d, b in seen])
+    landmarks = {i: Landmark(i, np.array([*place, 0.0]), np.eye(3), 0.0) for i, place in enumerate(places)}
+    write_map(LandmarkMap(landmarks), tmp_path / "map.yaml")
+    assert identify_motion_noise(tmp_path / "bag", tmp_path / "map.yaml", Config()) is None
