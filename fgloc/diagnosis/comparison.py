@@ -15,11 +15,15 @@ from fgloc.diagnosis.handling import Handling
 from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.pairs import Figure, RateFit, fit_rate
 from fgloc.diagnosis.signals import Path, Signals, turn_by
+from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 WHEELS: dict[str, Role] = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
 _UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
 _UNIT = 0.04  # logarithm by which a scale may miss a unit's
+WHEEL_UNITS = {math.pi / 180.0: "degrees", math.tau / 60.0: "revolutions per minute", math.tau: "revolutions"}
+_BEYOND = 0.005  # share of rates beyond a bound, which is of another unit then
+_WHEEL_UNIT = 0.2  # logarithm by which wheels may be off besides: radii and a track that nobody has measured
 
 
 def unit_of(scale: float, within: float = _UNIT, speeds: bool = True) -> tuple[float, str] | None:
@@ -34,6 +38,17 @@ def unit_of(scale: float, within: float = _UNIT, speeds: bool = True) -> tuple[f
     units = known | {1.0 / factor: f"metres for {name}" for factor, name in known.items()}
     factor = min(units, key=lambda unit: abs(math.log(abs(scale) / unit)))
     return (factor, units[factor]) if abs(math.log(abs(scale) / factor)) < within else None
+
+
+def wheel_unit_of(scale: float, within: float = _WHEEL_UNIT) -> tuple[float, str] | None:
+    """Factor and name of the unit of wheels' angles or rates that a motion (true over the wheels') is near.
+
+    Args:
+        scale: of a way or a turn, which such a unit changes alike; None is returned where it is near no usual unit.
+        within: logarithm by which it may miss the unit's.
+    """
+    factor = min(WHEEL_UNITS, key=lambda unit: abs(math.log(max(scale, 1e-9) / unit)))
+    return (factor, WHEEL_UNITS[factor]) if abs(math.log(max(scale, 1e-9) / factor)) < within else None
 
 
 @dataclass
@@ -107,6 +122,36 @@ class Conventions:
         wheels = self.config.wheels
         exchanged = {"wheels.left_joint": wheels.right_joint, "wheels.right_joint": wheels.left_joint}
         return exchanged if all(exchanged.values()) else {}
+
+    def in_wheel_unit(self, path: Path, scale: float, within: float = _WHEEL_UNIT) -> tuple[float, str] | None:
+        """`wheel_unit_of`, where the path is that of wheels taken to be in radians."""
+        return wheel_unit_of(scale, within) if path.source == "ticks" and self.config.wheels.in_radians else None
+
+    def with_wheel_unit(self, factor: float) -> dict[str, Any]:
+        """Lines that take the wheels' angles and rates to be in a unit of so many radians."""
+        wheels, bound = self.config.wheels, self.config.gate.max_wheel_rate
+        rates = [
+            float(np.abs(e.velocity).max())
+            for e in self.signals.motion
+            if isinstance(e, JointsEvent) and len(e.velocity)
+        ]
+        fast = rates and float(np.quantile(rates, 1.0 - _BEYOND)) > bound  # by a bound in radians they would be refused
+        lines = {"gate.max_wheel_rate": float(f"{bound / factor:.4g}")} if fast else {}
+        if wheels.drive is None and wheels.left_radius and wheels.right_radius:
+            radii = {"left_radius": wheels.left_radius, "right_radius": wheels.right_radius}
+            return lines | {f"wheels.{key}": float(f"{value * factor:.6g}") for key, value in radii.items()}
+        scales = {"scale_v": wheels.scale_v, "scale_omega": wheels.scale_omega}
+        return lines | {f"wheels.{key}": float(f"{value * factor:.6g}") for key, value in scales.items()}
+
+    def path_in_wheel_unit(self, factor: float) -> Path | None:
+        """Motion by wheels whose angles and rates are in a unit of so many radians; None: no wheels are like this."""
+        config = self.config
+        try:
+            for key, value in self.with_wheel_unit(factor).items():
+                config = with_value(config, key, value)
+        except ValueError:
+            return None
+        return self.signals.path(config)
 
     def trial(self) -> Conventions:
         """A comparison of the same signals whose findings do not count yet."""

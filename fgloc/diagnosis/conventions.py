@@ -45,6 +45,7 @@ def conventions(
     found.commanded = path.source == "command"
     odometry.check_sideways(found, path)
     path = odometry.check_angles(found, path)
+    path = gyro.check_wheel_unit(found, path, found.signals.sightings())
     odometry.check_commands(found, path)
     by_odometry = gyro.by_odometry(found, path)
     path = gyro.by_hand(found, path)
@@ -62,6 +63,8 @@ def conventions(
         path, found.wheels = found.signals.path(found.config) or path, found.config.wheels
     by_gyro, turn_sigma = landmarks.turn_of(path, turn)
     sensor = None if seen is None else landmarks.check_sensor(found, by_gyro, seen, turn_sigma)
+    if found.config.wheels != found.wheels:
+        path, found.wheels = found.signals.path(found.config) or path, found.config.wheels
     drifting = _drifts(found, path)
     undecided &= "imu.sign" not in found.codes
     body = None if undecided else truth.true_body(found, path)  # wheels that may turn the wrong way judge no truth

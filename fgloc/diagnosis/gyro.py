@@ -11,8 +11,9 @@ import numpy as np
 
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.handling import Span, cut, handling, outside
+from fgloc.diagnosis.landmarks import refutes
 from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit
-from fgloc.diagnosis.signals import Path
+from fgloc.diagnosis.signals import Path, Sightings
 from fgloc.frames import homogeneous, rotation_of, sensor_pose
 from fgloc.types import FloatArray, Severity
 
@@ -68,6 +69,32 @@ def by_hand(found: Conventions, path: Path) -> Path:
         return path
     found.signals = outside(found.signals, in_hand)
     return cut(path, in_hand)
+
+
+def check_wheel_unit(found: Conventions, path: Path, seen: Sightings | None) -> Path:
+    """Name wheels whose angles or rates are in another unit, by the gyro's turn; the path with that undone.
+
+    Args:
+        found: the comparison.
+        path: motion of the wheels.
+        seen: sightings in the sensor's axes, which must not refute the way in that unit.
+    """
+    if path.source != "ticks" or found.signals.rates() is None:
+        return path
+    fit = found.turn_about(path, found.up * found.config.gyro.scale)
+    if fit is None or fit.share < TELLS or fit.scale.value <= 0.0:
+        return path
+    unit = found.in_wheel_unit(path, 1.0 / fit.scale.value)
+    other = None if unit is None else found.path_in_wheel_unit(unit[0])
+    if unit is None or other is None or (seen is not None and refutes(found, other, seen)):
+        return path
+    text = (
+        f"The wheels turn {fit.scale.value:.3g} ± {fit.scale.sigma:.2g} times as much as the gyro: their angles or "
+        f"rates are in {unit[1]}"
+    )
+    share = Figure(1.0 / fit.scale.value, fit.scale.sigma / fit.scale.value**2)
+    found.add("wheels.unit", text, found.with_wheel_unit(unit[0]), share)
+    return other
 
 
 def _text(spans: Sequence[Span]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, with_value
-from fgloc.diagnosis.comparison import Conventions, unit_of
+from fgloc.diagnosis.comparison import WHEEL_UNITS, Conventions, unit_of
 from fgloc.diagnosis.landmark_fits import (
     AXES,
     Mounting,
@@ -28,7 +28,9 @@ from fgloc.diagnosis.signals import Path, Sightings
 from fgloc.frames import homogeneous, rpy_matrix, sensor_pose
 from fgloc.types import Finding, FloatArray, Severity
 
+_OTHERWISE = 0.25  # logarithm of a distance by which nothing is off but by its unit
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
+_WHEEL_UNIT = 0.1  # logarithm by which distances of landmarks may miss a unit of wheels that is named by them alone
 _SURVEYED = 0.15  # of a distance on a map: likewise for what is paced off, or mapped by worn wheels
 _MAPPED = 0.2  # logarithm by which distances on a map in another unit may be off besides
 _UNSURE = 0.1  # share of a scale by which it is not known
@@ -96,8 +98,11 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
     fits = fit_sightings(path, as_given, turn_sigma=turn_sigma)
     if not fits:
         return None
+    in_unit = _wheel_unit(found, path, as_given, fits)
+    if in_unit is not None:
+        path, fits = in_unit
     best = _best(fits)
-    reach = float(np.median(np.abs(planar(as_given.points, best.axes))))
+    reach = _reach(as_given, best)
     if best.misfit > _FITS * reach:
         return None  # nothing fits: the landmarks move, or the wheels slip throughout
     if best.scale.sigma > 0.3 * best.scale.value:  # too few landmarks, or the robot hardly moved
@@ -149,6 +154,61 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
         _scale(found, path, raw, chosen)
     found.noise = track_noise(path, raw, chosen)
     return chosen
+
+
+def _reach(seen: Sightings, m: Mounting) -> float:
+    return float(np.median(np.abs(planar(seen.points, m.axes))))
+
+
+def _unscaled(m: Mounting) -> bool:
+    """Whether ranges and wheels agree on distances, but for what either may be off by."""
+    return m.scale.sigma < 0.3 * m.scale.value and abs(math.log(m.scale.value)) < _OTHERWISE + 2.0 * m.scale.sigma
+
+
+def refutes(found: Conventions, path: Path, seen: Sightings) -> bool:
+    """Whether sightings determine distances, and others than a path does."""
+    as_given, _ = as_configured(found, seen)
+    fits = fit_sightings(path, as_given)
+    if not fits:
+        return False
+    best = _best(fits)
+    fitting = best.misfit < _FITS * _reach(as_given, best) and best.scale.sigma < 0.3 * best.scale.value
+    return fitting and not _unscaled(best)
+
+
+def _wheel_unit(
+    found: Conventions, path: Path, seen: Sightings, fits: Mapping[str, Mounting]
+) -> tuple[Path, dict[str, Mounting]] | None:
+    """Name wheels whose angles or rates are in another unit, by way and turn alike, and give the path without it.
+
+    No unit of the ranges does it: landmarks show how far the robot turns, whatever their distances are in.
+    """
+    if path.source != "ticks" or not found.config.wheels.in_radians:
+        return None
+    best = _best(fits)
+    if _unscaled(best) and best.misfit < _FITS * _reach(seen, best):
+        return None
+    tried: list[tuple[float, str, Path, dict[str, Mounting], Mounting]] = []
+    for factor, name in WHEEL_UNITS.items():
+        other = found.path_in_wheel_unit(factor)
+        if other is None:
+            continue
+        again = fit_sightings(other, seen)
+        m = _best(again) if again else best
+        turns = max(best.turns.value, 1e-9)
+        better = m.misfit * _WORSE < best.misfit or abs(math.log(turns / factor)) < _OTHERWISE
+        if again and better and _unscaled(m) and m.misfit < _FITS * _reach(seen, m):
+            tried.append((factor, name, other, again, m))
+    if not tried:
+        return None
+    factor, name, other, again, m = min(tried, key=lambda one: one[4].misfit)
+    scale = Figure(factor / m.scale.value, factor * m.scale.sigma / m.scale.value**2)
+    text = (
+        f"By the landmarks the robot moves and turns {scale.value:.3g} ± {scale.sigma:.2g} times as much as its wheels "
+        f"say: their angles or rates are in {name}"
+    )
+    found.add("wheels.unit", text, found.with_wheel_unit(factor), scale)
+    return other, again
 
 
 def _optical_by_few(found: Conventions, seen: Sightings, fits: Mapping[str, Mounting], best: Mounting) -> None:
@@ -333,25 +393,36 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
         if by_wheels.sigma > _UNSURE * by_wheels.value or not varied(path):
             return  # the wheels do not tell distances, as on one circle
         if on_map.off(1.0, _SCALE):
-            _three(found, by_wheels, on_map, ranges)
+            _three(found, path, by_wheels, on_map, ranges)
             return
     if not (by_wheels.off(1.0, _SCALE) and varied(path)):
         return
-    unit = unit_of(by_wheels.value)
+    inverse = Figure(1.0 / by_wheels.value, by_wheels.sigma / by_wheels.value**2)
+    sure = max(_WHEEL_UNIT, 2.0 * by_wheels.sigma / by_wheels.value)
+    in_unit, unit = found.in_wheel_unit(path, inverse.value, sure), unit_of(by_wheels.value)
+    line = round(by_wheels.value * found.config.landmarks.range_scale, 5)
+    if in_unit is not None:
+        text = (
+            f"Distances of landmarks are {inverse.value:.4g} ± {inverse.sigma:.2g} times those of the wheels' motion: "
+            f"the wheels' angles or rates are probably in {in_unit[1]} ({in_unit[0]:.4g} rad); or it is the ranges, "
+            f"and expert.landmarks.range_scale is {line:g}"
+        )
+        found.add("wheels.unit", text, found.with_wheel_unit(in_unit[0]), inverse)
+        return
     named = f" (they are in {unit[1]})" if unit is not None else ""
     rival = (
         "" if abs(math.log(by_wheels.value)) > 0.15 else f"; or the wheels' are {by_wheels.value:.3f} times too long"
     )
     text = (
-        f"Distances of landmarks are {1.0 / by_wheels.value:.4g} ± {by_wheels.sigma / by_wheels.value**2:.2g} times "
-        f"those of the wheels' motion{named}{rival}"
+        f"Distances of landmarks are {inverse.value:.4g} ± {inverse.sigma:.2g} times those of the wheels' motion"
+        f"{named}{rival}"
     )
     factor = by_wheels.value if unit is None else unit[0]
     lines = {"landmarks.range_scale": round(factor * found.config.landmarks.range_scale, 5)}
     found.add("sightings.scale", text, lines, by_wheels)
 
 
-def _three(found: Conventions, by_wheels: Figure, on_map: Figure, ranges: Figure) -> None:
+def _three(found: Conventions, path: Path, by_wheels: Figure, on_map: Figure, ranges: Figure) -> None:
     """Name the one of map, ranges and wheels that the other two contradict."""
     inverse = Figure(1.0 / on_map.value, on_map.sigma / on_map.value**2)
     unit = unit_of(inverse.value, _MAPPED, speeds=False)  # what is left, ranges or wheels may be off by
@@ -367,6 +438,11 @@ def _three(found: Conventions, by_wheels: Figure, on_map: Figure, ranges: Figure
         found.add("map.unit", text, {"map.scale": round(found.config.map.scale * factor, 6)}, inverse)
     elif not ranges.off(1.0, _SCALE):
         text = f"Distances by the wheels are {inverse.value:.4g} times those that map and sightings agree on"
+        in_unit = found.in_wheel_unit(path, on_map.value)
+        if in_unit is not None:
+            text += f": the wheels' angles or rates are in {in_unit[1]}"
+            found.add("wheels.unit", text, found.with_wheel_unit(in_unit[0]), on_map)
+            return
         scale_v = round(found.config.wheels.scale_v * on_map.value, 5)
         found.add("wheels.scale", text, {"wheels.scale_v": scale_v}, on_map)
     else:

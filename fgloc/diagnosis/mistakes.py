@@ -48,6 +48,7 @@ _FEWEST_IMAGES = 5
 _MOST_IDS = 12  # that are named
 _MOST_READINGS = 3  # of the recording, with stamps or mountings corrected in between
 _OF_CAMERA = ("camera", "markers", "setup", "sightings")  # of codes of findings on what a camera sees
+_OF_WHEELS = ("wheels.scale", "wheels.turn", "wheels.unit")
 _MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the place is known
 
 
@@ -98,7 +99,7 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
     undone = now != config or landmark_map is not None
     if undone and any(finding.severity is Severity.ERROR for finding in findings):
         said = "This run was made as if the lines above were set: set them."
-        if any(finding.code in ("wheels.scale", "wheels.turn") and not finding.lines for finding in findings):
+        if any(finding.code in _OF_WHEELS and not finding.lines for finding in findings):
             said += " What the truth alone says of the wheels is not applied."
         findings += note("setup.corrected", [said])
     return Mistakes(tuple(findings), now, landmark_map, undone, checked=True)

@@ -236,14 +236,14 @@ def check_angles(found: Conventions, path: Path) -> Path:
         if gyro is not None and gyro.share > TELLS and gyro.scale.value > 0.0:
             return path  # the odometry is wrong, and not used
     fitted, radius = settings_of(found.signals.motion), wheels.left_radius
-    unit = 1.0 if fitted is None or radius is None else fitted["left_radius"] / radius
-    if fitted is not None and abs(math.log(unit * 180.0 / math.pi)) < ROUGHLY:
+    ratio = 1.0 if fitted is None or radius is None else fitted["left_radius"] / radius
+    unit = found.in_wheel_unit(path, ratio, ROUGHLY)
+    if unit is not None:
         text = (
-            f"The wheels' angles are in degrees: by them the robot goes {1.0 / unit:.4g} times as far as its odometry"
+            f"The wheels' angles or rates are in {unit[1]}: by them the robot goes {1.0 / ratio:.4g} times as far as "
+            "its odometry"
         )
-        given = {"left_radius": wheels.left_radius, "right_radius": wheels.right_radius}
-        lines = {f"wheels.{key}": round(value * math.pi / 180.0, 8) for key, value in given.items() if value}
-        found.add("wheels.unit", text, lines, Figure(1.0 / unit, 0.0))
+        found.add("wheels.unit", text, found.with_wheel_unit(unit[0]), Figure(1.0 / ratio, 0.0))
     elif factor < 0.0:
         text = "The wheels' angles count backward when the robot goes forward, by the driver's odometry"
         found.add("wheels.reversed", text, {"wheels.source": "pose"})

@@ -207,6 +207,8 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
         return None
     _shared_yaw(found, own)
     fit = fit_body(path, own)
+    if fit is not None and fit.share > FOLLOWS and fit.turns.value > 0.0:
+        path, fit = _wheel_unit(found, path, own, fit)
     if fit is not None and fit.share > FOLLOWS and fit.turns.value > 0.0 and fit.turns.off(1.0, RATE_SCALE):
         turns = fit.turns
         if "wheels.turn" not in found.codes:
@@ -219,6 +221,22 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
             found.add("wheels.turn", text, None, turns, _refuted(turns, sigma))
         fit = fit_body(path.turned(turns.value), own)
     return None if fit is None or fit.misfit > 0.25 else fit
+
+
+def _wheel_unit(found: Conventions, path: Path, own: FloatArray, fit: BodyFit) -> tuple[Path, BodyFit]:
+    """Name wheels whose angles or rates are in another unit, by way and turn alike; path and fit without it."""
+    unit = found.in_wheel_unit(path, fit.turns.value)
+    other = None if unit is None else found.path_in_wheel_unit(unit[0])
+    again = None if other is None else fit_body(other, own)
+    if unit is None or other is None or again is None or abs(math.log(again.scale.value)) > _WHEELS_OFF:
+        return path, fit
+    lines = "; ".join(f"{key}: {value:g}" for key, value in found.with_wheel_unit(unit[0]).items())
+    text = (
+        f"By the truth the robot moves and turns {unit[0] * again.scale.value:.3g} times as much as its wheels say: "
+        f"their angles or rates are in {unit[1]}; if so, set {lines}"
+    )
+    found.add("wheels.unit", text, None, fit.turns)
+    return other, again
 
 
 def _refuted(by_truth: Figure, prior_sigma: float) -> Severity:

@@ -23,6 +23,7 @@ from fgloc.diagnosis.signals import Signals
 from fgloc.diagnosis.truth import BodyFit, check_body, true_body
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
+from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.types import Finding, Landmark, LandmarkMap, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 
@@ -35,6 +36,9 @@ X, Y = (np.concatenate([[0.0], np.cumsum(STEP_S * SPEED * f(YAW))[:-1]]) for f i
 _AROUND = np.linspace(0.0, math.tau, 9)[:-1]
 BEACONS = np.column_stack([X.mean() + 3.0 * np.cos(_AROUND) + 0.3 * _AROUND, Y.mean() + 2.5 * np.sin(_AROUND)])
 FOOT = 0.3048
+WHEELS, RADIUS, TRACK = ("left_wheel_joint", "right_wheel_joint"), 0.05, 0.3
+GEOMETRY = {"left_radius": RADIUS, "right_radius": RADIUS, "track": TRACK}
+RPM = 30.0 / math.pi
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Broken:
     imu_axes: tuple[tuple[float, ...], ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     imu_unit: float = 1.0
     imu_late: float = 0.0
+    joint_rate: float = 0.0  # of wheels that report rates, in place of an odometry; 0: none do
     speed: float = 1.0
     yaw_rate: float = 1.0
     turn: float = 1.0
@@ -83,6 +88,12 @@ def record(folder: Path, wrong: Broken) -> Path:
                 heading = wrong.turn * YAW
                 pose = (*(float(STEP_S * SPEED[:k] @ f(heading[:k])) for f in (np.cos, np.sin)), heading[k])
                 twist = (SPEED[k], 0.0, wrong.turn * RATE[k])
+            if wrong.joint_rate:
+                rates = [wrong.joint_rate * (SPEED[k] + side * 0.5 * TRACK * RATE[k]) / RADIUS for side in (-1.0, 1.0)]
+                messages.append(
+                    (received, lambda s=stamp, w=rates, r=received: bag.joints("/joints", s, WHEELS, (), w, (), r))
+                )
+                continue
             messages.append((received, lambda s=stamp, p=pose, t=twist, r=received: bag.odometry("/odom", s, p, t, r)))
         M = np.array(wrong.imu_axes, dtype=float)
         for k, stamp, received in at(50.0, wrong.imu_late):
@@ -134,6 +145,7 @@ def conventions_of(bag: Path, config: Config):
     return [f for f in found if f.severity is not Severity.NOTE and "." in f.code and not f.code.startswith("setup")]
 
 
+COMPARED = ("wheels", "sightings", "imu", "truth", "map", "scales", "motion")
 CASES = {
     "sightings mirrored (F4)": (Broken(bearing=-1.0), "sightings.mirrored", None),
     "ranges in feet": (Broken(range=1.0 / FOOT), "sightings.scale", FOOT),
@@ -176,6 +188,76 @@ def test_a_sound_recording_has_none(tmp_path):
     bag = record(tmp_path, Broken())
     assert not conventions_of(bag, Config())
     assert not [f for f in first_settings(bag).found if f.severity is not Severity.NOTE]
+
+
+@pytest.mark.parametrize("sensor", ["imu", "sightings", "truth"])
+@pytest.mark.parametrize("rate", [RPM, 180.0 / math.pi], ids=["rpm", "degrees"])
+def test_wheels_whose_rates_are_in_another_unit_are_named_and_nothing_else(tmp_path, sensor, rate):
+    bag = record(tmp_path, Broken(joint_rate=rate))
+    topics = {other: "none" for other in ("imu", "sightings", "truth") if other != sensor}
+    config = config_of({"recording": {"topics": topics}, "wheels": GEOMETRY})
+    compared = (f for f in inspect_all(bag, None, config).found if f.severity and f.code.split(".")[0] in COMPARED)
+    found, *others = compared
+    assert {f.code for f in others} <= ({"wheels.rates"} if sensor == "truth" else set())
+    assert (found.code, found.severity) == ("wheels.unit", Severity.ERROR)
+    assert 1.0 / found.value == pytest.approx(rate, rel=0.1)
+    if sensor == "truth":  # which judges the wheels in sentences only
+        assert not found.lines
+        return
+    lines = {key: float(value) for key, value in found.lines.items()}
+    radius = pytest.approx(RADIUS / rate, rel=1e-4)
+    assert {key: value for key, value in lines.items() if "radius" in key} == {
+        "wheels.left_radius": radius,
+        "wheels.right_radius": radius,
+    }
+    if rate > RPM:  # beyond the bound on rates in radians
+        assert lines["gate.max_wheel_rate"] > 500.0
+
+
+def test_wheels_in_another_unit_are_named_before_map_ranges_and_truth(tmp_path):
+    bag = record(tmp_path, Broken(joint_rate=RPM))
+    config = config_of({"recording": {"topics": {"imu": "none"}}, "wheels": GEOMETRY})
+    assert [f.code for f in conventions_of(bag, config)] == ["wheels.unit"]
+
+
+def test_sound_rates_of_wheels_have_no_unit_to_be_named(tmp_path):
+    bag = record(tmp_path, Broken(joint_rate=1.0))
+    assert not conventions_of(bag, config_of({"wheels": GEOMETRY}))
+
+
+@pytest.mark.parametrize("imu", ["auto", "none"])
+def test_a_track_that_is_ten_times_too_small_is_no_unit_of_the_wheels(tmp_path, imu):
+    bag = record(tmp_path, Broken(joint_rate=1.0))
+    topics = {"imu": "none"} if imu == "none" else {}
+    config = config_of({"recording": {"topics": topics}, "wheels": GEOMETRY | {"track": 0.1 * TRACK}})
+    assert "wheels.unit" not in {f.code for f in conventions_of(bag, config)}
+
+
+def test_on_a_straight_way_the_unit_of_ranges_or_of_the_wheels_are_both_told():
+    """Nothing turns: ranges and wheels alone disagree, by a factor that is a unit of wheels, so that both are told."""
+    t = np.arange(0.0, 30.0, 0.1)
+    speed = 0.3 + 0.15 * np.sin(0.9 * t)
+    x = np.append(0.0, np.cumsum(0.1 * speed)[:-1])
+    rates = RPM * speed / RADIUS
+    none = np.zeros(0)
+    motion = [
+        JointsEvent(round(s * 1e9), round(s * 1e9), "/joints", WHEELS, none, np.array([w, w]), none)
+        for s, w in zip(t.tolist(), rates.tolist(), strict=True)
+    ]
+    beacons = [(2.0 + 1.5 * i, 1.5 if i % 2 else -1.2) for i in range(8)]
+    rng = np.random.default_rng(3)
+    seen = [
+        (s, float(i), bx - at + rng.normal(0.0, 0.01), by + rng.normal(0.0, 0.01), 0.0)
+        for s, at in zip(t.tolist(), x.tolist(), strict=True)
+        for i, (bx, by) in enumerate(beacons)
+        if 0.5 < bx - at < 4.0
+    ]
+    found = {
+        f.code: f for f in conventions(Signals(motion=motion, seen=seen), config_of({"wheels": GEOMETRY})).findings
+    }
+    assert "sightings.scale" not in found
+    assert float(found["wheels.unit"].lines["wheels.left_radius"]) == pytest.approx(RADIUS / RPM, rel=1e-4)
+    assert "range_scale" in found["wheels.unit"].text
 
 
 def test_a_map_that_is_a_little_too_large_has_a_constant_and_no_unit(tmp_path):
