@@ -44,6 +44,8 @@ _MOST_LOG_SCALE = 10.0  # beyond any unit of length
 _GAINS = 2.5  # standard deviations of the gain from track to track: noise of the wheels gains up to 2.4
 _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheels
 _MAP_WINDOWS_S = (8.0, 20.0, 50.0)  # over which landmarks are compared with a map: the shortest that shows three
+_COARSE_S = (20.0, 50.0, 120.0, 300.0)  # likewise where one is in view at a time
+_COARSE_MISFIT, _COARSE_OF_THREE = 0.25, 0.1  # of a map so compared; three landmarks fit many maps
 _MAP_STEP, _FEWEST_WINDOWS = 0.625, 3  # from window to window, in their widths; of windows with three landmarks
 _STEEPEST = 30.0  # of a prior's cost: its exponential is a number
 _WINDOW_S = (
@@ -476,6 +478,37 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
             left_out.append([float(np.median(part))])
     sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else scale * max(misfit, _OF_THREE)
     return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit, len(scales))
+
+
+def coarse_scale(
+    path: Path, seen: Sightings, place: tuple[float, float], places: dict[int, FloatArray]
+) -> tuple[float, int] | None:
+    """Scale of a map over distances by wheels and sightings, of landmarks that need not be in one view.
+
+    The way from one landmark to the next is the wheels', whose drift leaves a unit of length to be told, and no more.
+
+    Args:
+        path: motion of the wheels.
+        seen: sightings in the base's axes.
+        place: of the sensor [m].
+        places: ``(2,)`` on the map [m], by id.
+
+    Returns:
+        The scale, and the number of landmarks that tell it; None: the map fits nowhere.
+    """
+    p, r = complex_poses(path, seen.times)
+    q = p + r * (planar(seen.points, "body") + complex(*place))
+    for width in _COARSE_S:
+        fits = []
+        for window in _places_seen(path, seen, q, width):
+            common = [i for i in window if i in places]
+            scales, misfits = _laid_on([window], places, 0, False)
+            fits += [(misfit, scale, len(common)) for scale, misfit in zip(scales, misfits, strict=True)]
+        if fits:
+            misfit, scale, count = max(fits, key=lambda fit: (fit[2], -fit[0]))
+            if misfit < (_COARSE_MISFIT if count > 3 else _COARSE_OF_THREE):
+                return scale, count
+    return None
 
 
 def _places_seen(path: Path, seen: Sightings, q: ComplexArray, width: float) -> Iterator[dict[int, complex]]:

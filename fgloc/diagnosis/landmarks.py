@@ -11,10 +11,11 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, with_value
-from fgloc.diagnosis.comparison import WHEEL_UNITS, Conventions, unit_of
+from fgloc.diagnosis.comparison import WHEEL_UNITS, WHEELS, Conventions, unit_of
 from fgloc.diagnosis.landmark_fits import (
     AXES,
     Mounting,
+    coarse_scale,
     compared,
     fit_map,
     fit_on_map,
@@ -47,6 +48,8 @@ _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
 _BY_FAR, _NEARLY = 5.0, 2.0  # times a misfit: of what is refuted by few landmarks, of what is as good with them
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
+_COARSELY = math.log(1.3)  # by which a scale by wheels alone may miss a unit
+_SCALED = {"map.unit", "map.contradiction", "map.mirrored", "map.ids", "sightings.scale", "wheels.scale", "scales"}
 _FIRST_S = 8.0  # of sightings that tell where a run began: wheels err by centimetres over it
 _NO_MAP = 0.5  # residual over the spread of the landmarks: they stand elsewhere
 _SURE = 6.0  # sigmas of the given pose
@@ -420,6 +423,29 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
     factor = by_wheels.value if unit is None else unit[0]
     lines = {"landmarks.range_scale": round(factor * found.config.landmarks.range_scale, 5)}
     found.add("sightings.scale", text, lines, by_wheels)
+
+
+def check_map_unit(found: Conventions, path: Path, seen: Sightings | None) -> None:
+    """Name the unit of a map whose landmarks are hardly ever in one view: by the wheels' way from one to the next."""
+    if seen is None or len(found.places) < 3 or path.source not in WHEELS or found.codes & _SCALED:
+        return
+    T = _place(found)
+    as_given, _ = as_configured(found, seen)
+    fitted = coarse_scale(path, as_given, (float(T[0, 3]), float(T[1, 3])), found.places)
+    if fitted is None:
+        return
+    scale, count = fitted
+    unit = unit_of(1.0 / scale, _COARSELY, speeds=False)
+    if unit is None and abs(math.log(scale / 10.0)) < _COARSELY:
+        unit = 0.1, "decimetres"
+    if unit is None:
+        return
+    text = (
+        f"Distances on the map are about {scale:.2g} times those that the wheels travel between sightings of its "
+        f"landmarks, by {count} of them (it is in {unit[1]})"
+    )
+    factor = round(found.config.map.scale * unit[0], 6)
+    found.add("map.unit", text, {"map.scale": factor}, Figure(1.0 / scale, _COARSELY / scale))
 
 
 def _three(found: Conventions, path: Path, by_wheels: Figure, on_map: Figure, ranges: Figure) -> None:

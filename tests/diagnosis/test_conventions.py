@@ -260,6 +260,25 @@ def test_on_a_straight_way_the_unit_of_ranges_or_of_the_wheels_are_both_told():
     assert "range_scale" in found["wheels.unit"].text
 
 
+@pytest.mark.parametrize(
+    ("factor", "scale"), [(1.0, None), (1.6, None), (100.0, "0.01"), (1.0 / FOOT, "0.3048"), (10.0, "0.1")]
+)
+def test_the_unit_of_a_map_is_named_where_one_landmark_is_in_view_at_a_time(factor, scale):
+    rng, some = np.random.default_rng(4), slice(None, None, 20)
+    t, x, y, yaw = TIMES[some], X[some], Y[some], YAW[some]
+    motion = [odometry(s, twist=(v, w)) for s, v, w in zip(t, SPEED[some], RATE[some], strict=True)]
+    which = (t / 10.0).astype(int)  # each beacon for ten seconds
+    away = (BEACONS[which] - np.column_stack([x, y])) @ [1.0, 1j] * np.exp(-1j * yaw)
+    away += rng.normal(0.0, 0.01, len(t)) + 1j * rng.normal(0.0, 0.01, len(t))
+    seen = [(s, float(i), z.real, z.imag, 0.0) for s, i, z in zip(t, which, away, strict=True)]
+    landmarks = {
+        i: Landmark(i, factor * np.array([bx, by, 0.0]), np.eye(3), 0.0) for i, (bx, by) in enumerate(BEACONS.tolist())
+    }
+    found = conventions(Signals(motion=motion, seen=seen), Config(), landmark_map=LandmarkMap(landmarks)).findings
+    named = [(f.code, f.severity, f.lines) for f in found if f.code.startswith("map.")]
+    assert named == ([] if scale is None else [("map.unit", Severity.ERROR, {"map.scale": scale})])
+
+
 def test_a_map_that_is_a_little_too_large_has_a_constant_and_no_unit(tmp_path):
     assert not [f for f in conventions_of(record(tmp_path, Broken(map=1.08)), Config()) if f.code.startswith("map.")]
 
