@@ -279,6 +279,22 @@ def test_the_unit_of_a_map_is_named_where_one_landmark_is_in_view_at_a_time(fact
     assert named == ([] if scale is None else [("map.unit", Severity.ERROR, {"map.scale": scale})])
 
 
+@pytest.mark.parametrize(("yaw", "is_named"), [(0.0, False), (3.0, True), (1.0, True)])
+def test_a_first_pose_is_refuted_where_one_landmark_is_in_view_at_a_time(yaw, is_named):
+    """The first comes after a while, and what else is found of the truth does not matter."""
+    some = (TIMES > 6.0) & (np.arange(len(TIMES)) % 20 == 0)
+    motion = [odometry(s, twist=(v, w)) for s, v, w in zip(TIMES[::20], SPEED[::20], RATE[::20], strict=True)]
+    t = TIMES[some]
+    which = (t / 12.0).astype(int)
+    away = (BEACONS[which] - np.column_stack([X[some], Y[some]])) @ [1.0, 1j] * np.exp(-1j * YAW[some])
+    seen = [(s, float(i), z.real, z.imag, 0.0) for s, i, z in zip(t, which, away, strict=True)]
+    landmarks = {i: Landmark(i, np.array([*place, 0.0]), np.eye(3), 0.0) for i, place in enumerate(BEACONS.tolist())}
+    config = config_of({"estimator": {"initial_pose": [0.0, 0.0, yaw]}})
+    found = conventions(Signals(motion=motion, seen=seen), config, landmark_map=LandmarkMap(landmarks))
+    assert ("frame.first_pose" in found.codes) == is_named
+    assert not is_named or found.config.estimator.initial_pose is None  # it is not used
+
+
 def test_a_map_that_is_a_little_too_large_has_a_constant_and_no_unit(tmp_path):
     assert not [f for f in conventions_of(record(tmp_path, Broken(map=1.08)), Config()) if f.code.startswith("map.")]
 
