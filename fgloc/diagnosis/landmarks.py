@@ -48,6 +48,7 @@ _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
 _BY_FAR, _NEARLY = 5.0, 2.0  # times a misfit: of what is refuted by few landmarks, of what is as good with them
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
+_NO_DRIFT = math.log(7.0)  # of a scale: less may be wheels that drift, and no map in feet is named so
 _COARSELY = math.log(1.3)  # by which a scale by wheels alone may miss a unit
 _SCALED = {"map.unit", "map.contradiction", "map.mirrored", "map.ids", "sightings.scale", "wheels.scale", "scales"}
 _FIRST_S = 8.0  # of sightings that tell where a run began: wheels err by centimetres over it
@@ -440,7 +441,7 @@ def check_map_unit(found: Conventions, path: Path, seen: Sightings | None) -> No
     unit = unit_of(1.0 / scale, _COARSELY, speeds=False)
     if unit is None and abs(math.log(scale / 10.0)) < _COARSELY:
         unit = 0.1, "decimetres"
-    if unit is None:
+    if unit is None or abs(math.log(scale)) < _NO_DRIFT:
         return
     text = (
         f"Distances on the map are about {scale:.3g} times those that the wheels travel between sightings of its "

@@ -122,9 +122,9 @@ def test_poses_whose_yaw_never_changes_are_positions_however_often_they_are_aske
 
 
 def test_points_are_no_truth_unless_their_topic_says_so(tmp_path):
-    code, out, _ = fgloc("info", write(tmp_path, topic="/clicked_point"))
+    code, out, _ = fgloc("info", write(tmp_path, topic="/leica/position"))
     assert code == 0
-    assert "recording.topics.truth: /clicked_point" in out
+    assert "recording.topics.truth: /leica/position" in out
 
 
 def test_what_needs_a_yaw_refuses_a_truth_without_one(bag):
