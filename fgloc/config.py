@@ -568,7 +568,7 @@ class GateConfig(Section):
 
     max_speed: float = expert(5.0, gt=0, le=1e3, description="of the robot")
     max_yaw_rate: float = expert(10.0, gt=0, le=1e4, description="of the robot")
-    max_wheel_rate: float = constant(500.0, "ticks taken for radians exceed it", gt=0, le=1e6, description="rad/s")
+    max_wheel_rate: float = expert(500.0, gt=0, le=1e6, description="of a joint [rad/s]; ticks exceed it")
     max_position: float = expert(1e6, gt=0, le=1e9, description="of an odometry or truth pose")
     max_range: float = expert(50.0, gt=0, le=1e5, description="of a sighting")
     min_range: float = constant(

@@ -21,7 +21,8 @@ from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 WHEELS: dict[str, Role] = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
 _UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimetres", 1 / 3.6: "km/h"}
 _UNIT = 0.04  # logarithm by which a scale may miss a unit's
-WHEEL_UNITS = {math.pi / 180.0: "degrees", math.tau / 60.0: "revolutions per minute", math.tau: "revolutions"}
+_WHEEL_UNITS = {math.pi / 180.0: "degrees", math.tau: "revolutions"}
+_RATE_UNITS = _WHEEL_UNITS | {math.tau / 60.0: "revolutions per minute"}  # no angle is in the last
 _BEYOND = 0.005  # share of rates beyond a bound, which is of another unit then
 _WHEEL_UNIT = 0.2  # logarithm by which wheels may be off besides: radii and a track that nobody has measured
 
@@ -38,17 +39,6 @@ def unit_of(scale: float, within: float = _UNIT, speeds: bool = True) -> tuple[f
     units = known | {1.0 / factor: f"metres for {name}" for factor, name in known.items()}
     factor = min(units, key=lambda unit: abs(math.log(abs(scale) / unit)))
     return (factor, units[factor]) if abs(math.log(abs(scale) / factor)) < within else None
-
-
-def wheel_unit_of(scale: float, within: float = _WHEEL_UNIT) -> tuple[float, str] | None:
-    """Factor and name of the unit of wheels' angles or rates that a motion (true over the wheels') is near.
-
-    Args:
-        scale: of a way or a turn, which such a unit changes alike; None is returned where it is near no usual unit.
-        within: logarithm by which it may miss the unit's.
-    """
-    factor = min(WHEEL_UNITS, key=lambda unit: abs(math.log(max(scale, 1e-9) / unit)))
-    return (factor, WHEEL_UNITS[factor]) if abs(math.log(max(scale, 1e-9) / factor)) < within else None
 
 
 @dataclass
@@ -123,9 +113,25 @@ class Conventions:
         exchanged = {"wheels.left_joint": wheels.right_joint, "wheels.right_joint": wheels.left_joint}
         return exchanged if all(exchanged.values()) else {}
 
+    @property
+    def wheel_units(self) -> Mapping[float, str]:
+        """Units [rad] and their names that the joints may be in: of angles where they have any, else of rates."""
+        joints = (event for event in self.signals.motion if isinstance(event, JointsEvent))
+        return _WHEEL_UNITS if any(np.isfinite(event.position).any() for event in joints) else _RATE_UNITS
+
     def in_wheel_unit(self, path: Path, scale: float, within: float = _WHEEL_UNIT) -> tuple[float, str] | None:
-        """`wheel_unit_of`, where the path is that of wheels taken to be in radians."""
-        return wheel_unit_of(scale, within) if path.source == "ticks" and self.config.wheels.in_radians else None
+        """Factor and name of the unit that wheels are in which were taken to be in radians; None: no usual one.
+
+        Args:
+            path: motion of the wheels; None is returned unless it is that of joints in radians.
+            scale: of the true way or turn over the wheels', which such a unit changes alike.
+            within: logarithm by which it may miss the unit's.
+        """
+        if path.source != "ticks" or not self.config.wheels.in_radians or scale <= 0.0:
+            return None
+        units = self.wheel_units
+        factor = min(units, key=lambda unit: abs(math.log(scale / unit)))
+        return (factor, units[factor]) if abs(math.log(scale / factor)) < within else None
 
     def with_wheel_unit(self, factor: float) -> dict[str, Any]:
         """Lines that take the wheels' angles and rates to be in a unit of so many radians."""

@@ -13,7 +13,7 @@ from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.handling import Span, cut, handling, outside
 from fgloc.diagnosis.landmarks import refutes
 from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit
-from fgloc.diagnosis.signals import Path, Sightings
+from fgloc.diagnosis.signals import Path
 from fgloc.frames import homogeneous, rotation_of, sensor_pose
 from fgloc.types import FloatArray, Severity
 
@@ -71,14 +71,8 @@ def by_hand(found: Conventions, path: Path) -> Path:
     return cut(path, in_hand)
 
 
-def check_wheel_unit(found: Conventions, path: Path, seen: Sightings | None) -> Path:
-    """Name wheels whose angles or rates are in another unit, by the gyro's turn; the path with that undone.
-
-    Args:
-        found: the comparison.
-        path: motion of the wheels.
-        seen: sightings in the sensor's axes, which must not refute the way in that unit.
-    """
+def check_wheel_unit(found: Conventions, path: Path) -> Path:
+    """Name wheels whose angles or rates are in another unit, by the gyro's turn; the path with that undone."""
     if path.source != "ticks" or found.signals.rates() is None:
         return path
     fit = found.turn_about(path, found.up * found.config.gyro.scale)
@@ -86,7 +80,9 @@ def check_wheel_unit(found: Conventions, path: Path, seen: Sightings | None) -> 
         return path
     unit = found.in_wheel_unit(path, 1.0 / fit.scale.value)
     other = None if unit is None else found.path_in_wheel_unit(unit[0])
-    if unit is None or other is None or (seen is not None and refutes(found, other, seen)):
+    if unit is None or other is None:
+        return path
+    if (seen := found.signals.sightings()) is not None and refutes(found, other, seen):
         return path
     text = (
         f"The wheels turn {fit.scale.value:.3g} ± {fit.scale.sigma:.2g} times as much as the gyro: their angles or "

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, with_value
-from fgloc.diagnosis.comparison import WHEEL_UNITS, WHEELS, Conventions, unit_of
+from fgloc.diagnosis.comparison import WHEELS, Conventions, unit_of
 from fgloc.diagnosis.landmark_fits import (
     AXES,
     Mounting,
@@ -195,7 +195,7 @@ def _wheel_unit(
     if _unscaled(best) and best.misfit < _FITS * _reach(seen, best):
         return None
     tried: list[tuple[float, str, Path, dict[str, Mounting], Mounting]] = []
-    for factor, name in WHEEL_UNITS.items():
+    for factor, name in found.wheel_units.items():
         other = found.path_in_wheel_unit(factor)
         if other is None:
             continue
@@ -504,28 +504,29 @@ def check_first_pose(found: Conventions, path: Path, seen: Sightings | None) -> 
         if started is None:
             continue
         left = float(np.median(np.hypot(*(se2.placed(started, points) - there).T)))
-        if seconds == _FIRST_S or left < _FITS_M:
-            drifted = () if seconds == _FIRST_S else _DRIFTED
-            sentence = first_pose_sentence(found.config, started, drifted)
+        if seconds == _FIRST_S:
+            sentence = first_pose_sentence(found.config, started)
+        elif left < _FITS_M:
+            sentence = first_pose_sentence(found.config, started, _DRIFTED)
         break
     if sentence is not None:
         found.findings.append(Finding("frame.first_pose", sentence, Severity.ERROR))
         found.config = with_value(found.config, "estimator.initial_pose", None)
 
 
-def first_pose_sentence(config: Config, started: FloatArray, drifted: Sequence[float] = ()) -> str | None:
+def first_pose_sentence(config: Config, started: FloatArray, drifted: Sequence[float] = (0.0, 0.0, 0.0)) -> str | None:
     """The sentence on a first pose that was given and is not where the sightings put it; None if it is.
 
     Args:
         config: as the run uses it.
         started: ``(3,)`` where the sightings put the run's first pose.
-        drifted: by how much more that may be off, m, m, rad; empty: by nothing.
+        drifted: by how much more that may be off [m, m, rad].
     """
     given = config.estimator.initial_pose
     if given is None:
         return None
     apart = se2.log(se2.between(given, started))
-    allowed = _SURE * np.array(config.estimator.initial_sigmas) + _SLACK + np.array(drifted or (0.0, 0.0, 0.0))
+    allowed = _SURE * np.array(config.estimator.initial_sigmas) + _SLACK + np.asarray(drifted)
     if (np.abs(apart) <= allowed).all():
         return None
     x, y, yaw = started

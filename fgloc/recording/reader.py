@@ -153,13 +153,10 @@ OWN = "/fgloc/"  # topics below are outputs of fgloc: of `fgloc live`, of this p
 _CAMERA_INFO = ("camera_info",)  # its usual name
 # Words (between / and _) by which a topic says what it is.
 TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "mocap", "vicon", "optitrack", "vrpn", "qualisys"})
+_NO_BASE_WORDS = r"goal|target|setpoint|clicked|plan|waypoint|aruco|markers?|(april)?tags?|detections?"
+_NO_BASE = re.compile(rf"(?<![a-z])({_NO_BASE_WORDS})(?![a-z])", re.IGNORECASE)  # a pose, and not the robot's
 _NOT_TRUTH = re.compile(
-    r"(?<![a-z])(goal|initial_?pose|target|setpoint|clicked|plan|waypoint|amcl|ekf|ukf|slam|filter(ed)?|estimated?|"
-    r"combined|aruco|markers?|(april)?tags?|detections?|odom)(?![a-z])",
-    re.IGNORECASE,
-)
-_NO_BASE = re.compile(  # poses that are not the robot's, whatever a user may want them for
-    r"(?<![a-z])(goal|target|setpoint|clicked|plan|waypoint|aruco|markers?|(april)?tags?|detections?)(?![a-z])",
+    rf"(?<![a-z])({_NO_BASE_WORDS}|initial_?pose|amcl|ekf|ukf|slam|filter(ed)?|estimated?|combined|odom)(?![a-z])",
     re.IGNORECASE,
 )
 _NOT_IMAGE = re.compile(

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from event_makers import odometry
 
-from fgloc.calibration.first_settings import first_settings
-from fgloc.config import Config, config_of, config_of_file
+from fgloc.calibration.first_settings import first_settings, with_findings
+from fgloc.config import Config, config_of, config_of_file, load_config
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.conventions import conventions
 from fgloc.diagnosis.mistakes import inspect_all
@@ -54,6 +54,7 @@ class Broken:
     imu_unit: float = 1.0
     imu_late: float = 0.0
     joint_rate: float = 0.0  # of wheels that report rates, in place of an odometry; 0: none do
+    joint_angle: float = 0.0  # of a joint over the wheel's
     speed: float = 1.0
     yaw_rate: float = 1.0
     turn: float = 1.0
@@ -88,6 +89,13 @@ def record(folder: Path, wrong: Broken) -> Path:
                 heading = wrong.turn * YAW
                 pose = (*(float(STEP_S * SPEED[:k] @ f(heading[:k])) for f in (np.cos, np.sin)), heading[k])
                 twist = (SPEED[k], 0.0, wrong.turn * RATE[k])
+            if wrong.joint_angle:
+                ways = (STEP_S * SPEED[:k].sum() + side * 0.5 * TRACK * YAW[k] for side in (-1.0, 1.0))
+                angles = [wrong.joint_angle * way / RADIUS for way in ways]
+                messages.append(
+                    (received, lambda s=stamp, a=angles, r=received: bag.joints("/joints", s, WHEELS, a, (), (), r))
+                )
+                continue
             if wrong.joint_rate:
                 rates = [wrong.joint_rate * (SPEED[k] + side * 0.5 * TRACK * RATE[k]) / RADIUS for side in (-1.0, 1.0)]
                 messages.append(
@@ -211,7 +219,9 @@ def test_wheels_whose_rates_are_in_another_unit_are_named_and_nothing_else(tmp_p
         "wheels.right_radius": radius,
     }
     if rate > RPM:  # beyond the bound on rates in radians
-        assert lines["gate.max_wheel_rate"] > 500.0
+        assert lines["expert.gate.max_wheel_rate"] > 500.0
+    (tmp_path / "robot.yaml").write_text(with_findings("", [found]))
+    load_config(tmp_path / "robot.yaml")  # the lines are settings
 
 
 def test_wheels_in_another_unit_are_named_before_map_ranges_and_truth(tmp_path):
@@ -231,6 +241,16 @@ def test_a_track_that_is_ten_times_too_small_is_no_unit_of_the_wheels(tmp_path, 
     topics = {"imu": "none"} if imu == "none" else {}
     config = config_of({"recording": {"topics": topics}, "wheels": GEOMETRY | {"track": 0.1 * TRACK}})
     assert "wheels.unit" not in {f.code for f in conventions_of(bag, config)}
+
+
+@pytest.mark.parametrize("imu", ["auto", "none"])
+def test_angles_of_a_motor_before_a_gear_are_not_said_to_be_revolutions_per_minute(tmp_path, imu):
+    """Ten turns of the motor for one of the wheel are near that unit of rates, in which no angle is."""
+    bag = record(tmp_path, Broken(joint_angle=10.0))
+    topics = {"imu": "none"} if imu == "none" else {}
+    found = conventions_of(bag, config_of({"recording": {"topics": topics}, "wheels": GEOMETRY}))
+    assert found
+    assert "wheels.unit" not in {f.code for f in found}
 
 
 def test_on_a_straight_way_the_unit_of_ranges_or_of_the_wheels_are_both_told():
