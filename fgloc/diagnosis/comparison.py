@@ -24,6 +24,8 @@ _UNIT = 0.04  # logarithm by which a scale may miss a unit's
 _WHEEL_UNITS = {math.pi / 180.0: "degrees", math.tau: "revolutions"}
 _RATE_UNITS = _WHEEL_UNITS | {math.tau / 60.0: "revolutions per minute"}  # no angle is in the last
 _BEYOND = 0.005  # share of rates beyond a bound, which is of another unit then
+_GEAR = 0.4  # logarithm from which way and turn that are off alike are a gear's, and no radius that was measured badly
+GEAR = 0.25  # logarithm from which way and turn that are off alike are no radii that were measured badly
 _WHEEL_UNIT = 0.2  # logarithm by which wheels may be off besides: radii and a track that nobody has measured
 
 
@@ -133,8 +135,23 @@ class Conventions:
         factor = min(units, key=lambda unit: abs(math.log(scale / unit)))
         return (factor, units[factor]) if abs(math.log(scale / factor)) < within else None
 
-    def with_wheel_unit(self, factor: float) -> dict[str, Any]:
-        """Lines that take the wheels' angles and rates to be in a unit of so many radians."""
+    def wheels_off_by(self, path: Path, scale: float) -> tuple[float, str, str] | None:
+        """Factor, code and clause of what scales way and turn of the wheels alike; None: nothing does by so much.
+
+        Args:
+            path: motion of the wheels; None is returned where it is none of theirs.
+            scale: of the true turn over the wheels'; their way has to be looked at.
+        """
+        if (unit := self.in_wheel_unit(path, scale)) is not None:
+            return unit[0], "wheels.unit", f"their angles or rates are in {unit[1]}"
+        if path.source not in WHEELS or not abs(math.log(max(scale, 1e-9))) > GEAR:
+            return None
+        gear = f"they are measured before a gear of {1.0 / scale:.4g} : 1, or " if scale < 1.0 else ""
+        wrong = "radii" if path.source == "ticks" and self.config.wheels.in_radians else "radii or counts of a turn"
+        return scale, "wheels.gear", f"{gear}their {wrong} are wrong"
+
+    def wheel_lines(self, factor: float) -> dict[str, Any]:
+        """Lines by which the wheels move and turn the robot so many times as much."""
         wheels, bound = self.config.wheels, self.config.gate.max_wheel_rate
         rates = [
             float(np.abs(e.velocity).max())
@@ -149,11 +166,11 @@ class Conventions:
         scales = {"scale_v": wheels.scale_v, "scale_omega": wheels.scale_omega}
         return lines | {f"wheels.{key}": float(f"{value * factor:.6g}") for key, value in scales.items()}
 
-    def path_in_wheel_unit(self, factor: float) -> Path | None:
-        """Motion by wheels whose angles and rates are in a unit of so many radians; None: no wheels are like this."""
+    def path_of_wheels(self, factor: float) -> Path | None:
+        """Motion by wheels that move and turn the robot so many times as much; None: no wheels are like this."""
         config = self.config
         try:
-            for key, value in self.with_wheel_unit(factor).items():
+            for key, value in self.wheel_lines(factor).items():
                 config = with_value(config, key, value)
         except ValueError:
             return None

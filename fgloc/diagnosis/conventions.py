@@ -45,7 +45,7 @@ def conventions(
     found.commanded = path.source == "command"
     odometry.check_sideways(found, path)
     path = odometry.check_angles(found, path)
-    path = gyro.check_wheel_unit(found, path)
+    path = gyro.check_wheels(found, path)
     odometry.check_commands(found, path)
     by_odometry = gyro.by_odometry(found, path)
     path = gyro.by_hand(found, path)

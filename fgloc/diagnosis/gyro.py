@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.handling import Span, cut, handling, outside
-from fgloc.diagnosis.landmarks import refutes
+from fgloc.diagnosis.landmarks import distances_agree
 from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit
 from fgloc.diagnosis.signals import Path
 from fgloc.frames import homogeneous, rotation_of, sensor_pose
@@ -71,25 +71,29 @@ def by_hand(found: Conventions, path: Path) -> Path:
     return cut(path, in_hand)
 
 
-def check_wheel_unit(found: Conventions, path: Path) -> Path:
-    """Name wheels whose angles or rates are in another unit, by the gyro's turn; the path with that undone."""
-    if path.source != "ticks" or found.signals.rates() is None:
+def check_wheels(found: Conventions, path: Path) -> Path:
+    """Name wheels in another unit, before a gear or of other radii, by the gyro's turn; the path with that undone.
+
+    A unit is one unless sightings refute it; anything else may be the track alone, unless sightings confirm it.
+    """
+    if found.signals.rates() is None:
         return path
     fit = found.turn_about(path, found.up * found.config.gyro.scale)
     if fit is None or fit.share < TELLS or fit.scale.value <= 0.0:
         return path
-    unit = found.in_wheel_unit(path, 1.0 / fit.scale.value)
-    other = None if unit is None else found.path_in_wheel_unit(unit[0])
-    if unit is None or other is None:
+    off_by = found.wheels_off_by(path, 1.0 / fit.scale.value)
+    other = None if off_by is None else found.path_of_wheels(off_by[0])
+    if off_by is None or other is None:
         return path
-    if (seen := found.signals.sightings()) is not None and refutes(found, other, seen):
+    factor, code, clause = off_by
+    seen = found.signals.sightings()
+    agree = None if seen is None else distances_agree(found, other, seen)
+    if agree is False or (agree is None and code != "wheels.unit"):
         return path
-    text = (
-        f"The wheels turn {fit.scale.value:.3g} ± {fit.scale.sigma:.2g} times as much as the gyro: their angles or "
-        f"rates are in {unit[1]}"
-    )
+    also = ", and by the landmarks they move as much too far" if agree else ""
+    text = f"The wheels turn {fit.scale.value:.3g} ± {fit.scale.sigma:.2g} times as much as the gyro{also}: {clause}"
     share = Figure(1.0 / fit.scale.value, fit.scale.sigma / fit.scale.value**2)
-    found.add("wheels.unit", text, found.with_wheel_unit(unit[0]), share)
+    found.add(code, text, found.wheel_lines(factor), share)
     return other
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc import se2
 from fgloc.config import Config, with_value
-from fgloc.diagnosis.comparison import WHEELS, Conventions, unit_of
+from fgloc.diagnosis.comparison import GEAR, WHEELS, Conventions, unit_of
 from fgloc.diagnosis.landmark_fits import (
     AXES,
     Mounting,
@@ -43,6 +43,7 @@ _ASKEW_RAD = 0.08  # standard deviation of bearings from which on depths differ 
 _LEAST_COS = math.cos(math.radians(80.0))  # as the measurement has it
 _GAIN, _GAIN_SIGMAS = 0.05, 3.0  # of the log-likelihood of a sighting, by which another reading is named
 _BIASED = 3.0  # times the configured bias that ranges usually are: shorter ones are in another unit than it
+_ALIKE_OFF = 0.15  # logarithm by which way and turn may differ that are off by one cause
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
@@ -104,9 +105,9 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
     fits = fit_sightings(path, as_given, turn_sigma=turn_sigma)
     if not fits:
         return None
-    in_unit = _wheel_unit(found, path, as_given, fits)
-    if in_unit is not None:
-        path, fits = in_unit
+    without = _wheels_off(found, path, as_given, fits)
+    if without is not None:
+        path, fits = without
     best = _best(fits)
     reach = _reach(as_given, best)
     if best.misfit > _FITS * reach:
@@ -171,50 +172,72 @@ def _unscaled(m: Mounting) -> bool:
     return m.scale.sigma < 0.3 * m.scale.value and abs(math.log(m.scale.value)) < _OTHERWISE + 2.0 * m.scale.sigma
 
 
-def refutes(found: Conventions, path: Path, seen: Sightings) -> bool:
-    """Whether sightings determine distances, and others than a path does."""
+def distances_agree(found: Conventions, path: Path, seen: Sightings) -> bool | None:
+    """Whether distances by sightings are those of a path; None: sightings do not determine them."""
     as_given, _ = as_configured(found, seen)
-    fits = fit_sightings(path, as_given)
-    if not fits:
-        return False
-    best = _best(fits)
-    fitting = best.misfit < _FITS * _reach(as_given, best) and best.scale.sigma < 0.3 * best.scale.value
-    return fitting and not _unscaled(best)
+    best = _fitting(fit_sightings(path, as_given), as_given)
+    return None if best is None or best.scale.sigma > 0.3 * best.scale.value else _unscaled(best)
 
 
-def _wheel_unit(
+def _fitting(fits: Mapping[str, Mounting], seen: Sightings) -> Mounting | None:
+    """Best of fits by which landmarks stay in place; None: none is like this."""
+    best = _best(fits) if fits else None
+    return None if best is None or best.misfit > _FITS * _reach(seen, best) else best
+
+
+def _wheels_off(
     found: Conventions, path: Path, seen: Sightings, fits: Mapping[str, Mounting]
 ) -> tuple[Path, dict[str, Mounting]] | None:
-    """Name wheels whose angles or rates are in another unit, by way and turn alike, and give the path without it.
+    """Name wheels in another unit, before a gear or of other radii, by way and turn alike; path and fits without it.
 
     No unit of the ranges does it: landmarks show how far the robot turns, whatever their distances are in.
     """
-    if path.source != "ticks" or not found.config.wheels.in_radians:
+    best = _fitting(fits, seen)
+    if path.source not in WHEELS or (best is not None and _unscaled(best)):
         return None
-    best = _best(fits)
-    if _unscaled(best) and best.misfit < _FITS * _reach(seen, best):
-        return None
-    tried: list[tuple[float, str, Path, dict[str, Mounting], Mounting]] = []
-    for factor, name in found.wheel_units.items():
-        other = found.path_in_wheel_unit(factor)
-        if other is None:
+    tried: list[tuple[float, Path, dict[str, Mounting], Mounting]] = []
+    alike = [] if best is None else [best.turns.value] * _alike(best)
+    for factor in found.wheel_units if path.source == "ticks" and found.config.wheels.in_radians else ():
+        fitted = _of_wheels(found, seen, factor)
+        if fitted is None:
             continue
-        again = fit_sightings(other, seen)
-        m = _best(again) if again else best
-        turns = max(best.turns.value, 1e-9)
-        better = m.misfit * _WORSE < best.misfit or abs(math.log(turns / factor)) < _OTHERWISE
-        if again and better and _unscaled(m) and m.misfit < _FITS * _reach(seen, m):
-            tried.append((factor, name, other, again, m))
+        m = fitted[-1]
+        turns = max(_best(fits).turns.value, 1e-9)
+        better = m.misfit * _WORSE < _best(fits).misfit or abs(math.log(turns / factor)) < _OTHERWISE
+        if _unscaled(m):
+            tried += [(factor, *fitted)] * better
+        elif _alike(m):
+            alike.append(factor * m.turns.value)
+    if not tried:
+        others = (float(f"{scale:.4g}") for scale in alike if abs(math.log(scale)) > GEAR)
+        tried = [(scale, *fitted) for scale in others if (fitted := _of_wheels(found, seen, scale)) is not None]
+        tried = [one for one in tried if _unscaled(one[-1])]
     if not tried:
         return None
-    factor, name, other, again, m = min(tried, key=lambda one: one[4].misfit)
+    factor, other, again, m = min(tried, key=lambda one: one[-1].misfit)
+    off_by = found.wheels_off_by(path, factor)
+    if off_by is None:
+        return None
     scale = Figure(factor / m.scale.value, factor * m.scale.sigma / m.scale.value**2)
     text = (
         f"By the landmarks the robot moves and turns {scale.value:.3g} ± {scale.sigma:.2g} times as much as its wheels "
-        f"say: their angles or rates are in {name}"
+        f"say: {off_by[2]}"
     )
-    found.add("wheels.unit", text, found.with_wheel_unit(factor), scale)
+    found.add(off_by[1], text, found.wheel_lines(factor), scale)
     return other, again
+
+
+def _alike(m: Mounting) -> bool:
+    """Whether the wheels' way is off by what their turn is off by."""
+    return m.turns.value > 0.0 and abs(math.log(m.scale.value * m.turns.value)) < _ALIKE_OFF
+
+
+def _of_wheels(found: Conventions, seen: Sightings, factor: float) -> tuple[Path, dict[str, Mounting], Mounting] | None:
+    """Path of wheels that turn so many times as much, and the fits of sightings to it; None: landmarks wander."""
+    path = found.path_of_wheels(factor)
+    fits = None if path is None else fit_sightings(path, seen)
+    best = _fitting(fits, seen) if fits else None
+    return None if path is None or not fits or best is None else (path, fits, best)
 
 
 def _optical_by_few(found: Conventions, seen: Sightings, fits: Mapping[str, Mounting], best: Mounting) -> None:
@@ -413,12 +436,10 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
             f"the wheels' angles or rates are probably in {in_unit[1]} ({in_unit[0]:.4g} rad); or it is the ranges, "
             f"and expert.landmarks.range_scale is {line:g}"
         )
-        found.add("wheels.unit", text, found.with_wheel_unit(in_unit[0]), inverse)
+        found.add("wheels.unit", text, found.wheel_lines(in_unit[0]), inverse)
         return
     named = f" (they are in {unit[1]})" if unit is not None else ""
-    rival = (
-        "" if abs(math.log(by_wheels.value)) > 0.15 else f"; or the wheels' are {by_wheels.value:.3f} times too long"
-    )
+    rival = "" if unit is not None else f"; or the wheels' are {by_wheels.value:.3f} times too long"
     text = (
         f"Distances of landmarks are {inverse.value:.4g} ± {inverse.sigma:.2g} times those of the wheels' motion"
         f"{named}{rival}"
@@ -470,7 +491,7 @@ def _three(found: Conventions, path: Path, by_wheels: Figure, on_map: Figure, ra
         in_unit = found.in_wheel_unit(path, on_map.value)
         if in_unit is not None:
             text += f": the wheels' angles or rates are in {in_unit[1]}"
-            found.add("wheels.unit", text, found.with_wheel_unit(in_unit[0]), on_map)
+            found.add("wheels.unit", text, found.wheel_lines(in_unit[0]), on_map)
             return
         scale_v = round(found.config.wheels.scale_v * on_map.value, 5)
         found.add("wheels.scale", text, {"wheels.scale_v": scale_v}, on_map)

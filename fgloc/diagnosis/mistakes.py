@@ -48,7 +48,7 @@ _FEWEST_IMAGES = 5
 _MOST_IDS = 12  # that are named
 _MOST_READINGS = 3  # of the recording, with stamps or mountings corrected in between
 _OF_CAMERA = ("camera", "markers", "setup", "sightings")  # of codes of findings on what a camera sees
-_OF_WHEELS = ("wheels.scale", "wheels.turn", "wheels.unit")
+_OF_WHEELS = ("wheels.scale", "wheels.turn", "wheels.unit", "wheels.gear")
 _MOST_TRAVEL_S = 30.0  # from the first motion to the first image in which the place is known
 
 

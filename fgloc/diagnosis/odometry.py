@@ -243,7 +243,7 @@ def check_angles(found: Conventions, path: Path) -> Path:
             f"The wheels' angles or rates are in {unit[1]}: by them the robot goes {1.0 / ratio:.4g} times as far as "
             "its odometry"
         )
-        found.add("wheels.unit", text, found.with_wheel_unit(unit[0]), Figure(1.0 / ratio, 0.0))
+        found.add("wheels.unit", text, found.wheel_lines(unit[0]), Figure(1.0 / ratio, 0.0))
     elif factor < 0.0:
         text = "The wheels' angles count backward when the robot goes forward, by the driver's odometry"
         found.add("wheels.reversed", text, {"wheels.source": "pose"})

@@ -37,7 +37,7 @@ from fgloc.types import FloatArray, Severity
 
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _RESPONSE_S = 0.1  # a robot follows its commands with a lag of its own, which is no clock's
-_WHEELS_OFF = 0.2  # log scale of a truth: wheels may be off by less, and a truth that is no unit is seldom off by more
+_WHEELS_OFF = 0.2  # logarithm of a way that a unit or a gear leaves
 _PRIOR_SIGMAS = 4.0  # of the wheels, by which a truth may find them off: what is further off no run estimates
 _KNOWN_YAW = 0.01  # rad: sigma of the yaw of a tracked body that hardly turned
 _FROZEN_S, _MOVES_MPS, _FROZEN_SHARE = 0.1, 0.05, 0.02  # of a truth; fewer repetitions are a slower source's
@@ -208,7 +208,7 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
     _shared_yaw(found, own)
     fit = fit_body(path, own)
     if fit is not None and fit.share > FOLLOWS and fit.turns.value > 0.0:
-        path, fit = _wheel_unit(found, path, own, fit)
+        path, fit = _wheels_off(found, path, own, fit)
     if fit is not None and fit.share > FOLLOWS and fit.turns.value > 0.0 and fit.turns.off(1.0, RATE_SCALE):
         turns = fit.turns
         if "wheels.turn" not in found.codes:
@@ -223,19 +223,20 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
     return None if fit is None or fit.misfit > 0.25 else fit
 
 
-def _wheel_unit(found: Conventions, path: Path, own: FloatArray, fit: BodyFit) -> tuple[Path, BodyFit]:
-    """Name wheels whose angles or rates are in another unit, by way and turn alike; path and fit without it."""
-    unit = found.in_wheel_unit(path, fit.turns.value)
-    other = None if unit is None else found.path_in_wheel_unit(unit[0])
+def _wheels_off(found: Conventions, path: Path, own: FloatArray, fit: BodyFit) -> tuple[Path, BodyFit]:
+    """Name wheels in another unit, before a gear or of other radii, by way and turn alike; path and fit without it."""
+    off_by = found.wheels_off_by(path, fit.turns.value)
+    other = None if off_by is None else found.path_of_wheels(off_by[0])
     again = None if other is None else fit_body(other, own)
-    if unit is None or other is None or again is None or abs(math.log(again.scale.value)) > _WHEELS_OFF:
+    if off_by is None or other is None or again is None or abs(math.log(again.scale.value)) > _WHEELS_OFF:
         return path, fit
-    lines = "; ".join(f"{key}: {value:g}" for key, value in found.with_wheel_unit(unit[0]).items())
+    factor, code, clause = off_by
+    lines = "; ".join(f"{key}: {value:g}" for key, value in found.wheel_lines(factor).items())
     text = (
-        f"By the truth the robot moves and turns {unit[0] * again.scale.value:.3g} times as much as its wheels say: "
-        f"their angles or rates are in {unit[1]}; if so, set {lines}"
+        f"By the truth the robot moves and turns {factor * again.scale.value:.3g} times as much as its wheels say: "
+        f"{clause}; if so, set {lines}"
     )
-    found.add("wheels.unit", text, None, fit.turns)
+    found.add(code, text, None, fit.turns)
     return other, again
 
 
@@ -317,7 +318,7 @@ def check_body(found: Conventions, fit: BodyFit) -> None:
         found.add("truth.yaw_sign", text, None, fit.turns, warn)
         return
     scale, unit = fit.scale, unit_of(1.0 / fit.scale.value)
-    if unit is None and abs(math.log(scale.value)) < _WHEELS_OFF:
+    if unit is None:  # a truth is in a unit
         if scale.off(1.0, _SCALE):
             scale_v = round(found.wheels.scale_v * scale.value, 4)
             text = (
@@ -326,10 +327,10 @@ def check_body(found: Conventions, fit: BodyFit) -> None:
             )
             found.add("wheels.scale", text, None, scale, _refuted(scale, found.config.wheels.scale_sigma))
     elif scale.off(1.0, 0.08):
-        factor = 1.0 / scale.value if unit is None else unit[0]
-        named = f" (it is in {unit[1]})" if unit is not None else ""
-        text = f"Distances of the truth are {scale.value:.4g} ± {scale.sigma:.2g} times the wheels'{named}"
-        found.add("truth.scale", text, {"truth.scale": round(section.scale * factor, 6)}, scale, warn)
+        text = (
+            f"Distances of the truth are {scale.value:.4g} ± {scale.sigma:.2g} times the wheels' (it is in {unit[1]})"
+        )
+        found.add("truth.scale", text, {"truth.scale": round(section.scale * unit[0], 6)}, scale, warn)
     late_s = fit.late_s
     if late_s.off(0.0, _RESPONSE_S if found.commanded else LATE_S, LAG_SIGMAS) and fit.share > FOLLOWS:
         side = "late" if late_s.value > 0 else "early"

@@ -243,14 +243,25 @@ def test_a_track_that_is_ten_times_too_small_is_no_unit_of_the_wheels(tmp_path, 
     assert "wheels.unit" not in {f.code for f in conventions_of(bag, config)}
 
 
-@pytest.mark.parametrize("imu", ["auto", "none"])
-def test_angles_of_a_motor_before_a_gear_are_not_said_to_be_revolutions_per_minute(tmp_path, imu):
-    """Ten turns of the motor for one of the wheel are near that unit of rates, in which no angle is."""
-    bag = record(tmp_path, Broken(joint_angle=10.0))
-    topics = {"imu": "none"} if imu == "none" else {}
-    found = conventions_of(bag, config_of({"recording": {"topics": topics}, "wheels": GEOMETRY}))
-    assert found
-    assert "wheels.unit" not in {f.code for f in found}
+@pytest.mark.parametrize(
+    ("gear", "without"),
+    [(10.0, ()), (30.0, ("imu",)), (10.0, ("imu", "truth")), (0.5, ("imu", "truth")), (2.0, ("imu", "sightings"))],
+)
+def test_wheels_before_a_gear_or_of_other_radii_are_named_and_nothing_else(tmp_path, gear, without):
+    """A diameter for a radius is one; 10 is no revolution per minute, in which no angle is."""
+    bag = record(tmp_path, Broken(joint_angle=gear))
+    config = config_of({"recording": {"topics": dict.fromkeys(without, "none")}, "wheels": GEOMETRY})
+    found = [f for f in conventions_of(bag, config) if f.code.split(".")[0] in COMPARED]
+    assert [f.code for f in found] == ["wheels.gear"]
+    if found[0].lines:  # the truth judges the wheels in sentences only
+        assert float(found[0].lines["wheels.left_radius"]) == pytest.approx(RADIUS / gear, rel=0.01)
+
+
+def test_a_truth_that_is_no_unit_is_not_fitted_to_wheels_of_wrong_radii_and_track(tmp_path):
+    bag = record(tmp_path, Broken(joint_angle=2.0))
+    topics = {"imu": "none", "sightings": "none"}
+    found = conventions_of(bag, config_of({"recording": {"topics": topics}, "wheels": GEOMETRY | {"track": 0.15}}))
+    assert {f.code for f in found if not f.code.startswith("place")} == {"wheels.turn", "wheels.scale"}
 
 
 def test_on_a_straight_way_the_unit_of_ranges_or_of_the_wheels_are_both_told():
