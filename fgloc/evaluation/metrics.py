@@ -26,7 +26,7 @@ from fgloc.diagnosis.truth import truth_sentence
 from fgloc.errors import CovarianceError, TrajectoryError
 from fgloc.evaluation.judgements import Figures, Judgement, episodes, judgements
 from fgloc.results import RunData
-from fgloc.types import Finding, FloatArray, IntArray, Severity, Trajectory, ordered
+from fgloc.types import Finding, FloatArray, IntArray, Mode, Severity, Trajectory, ordered
 
 # --- Pairs of estimated and true poses at the same times --------------------------------------------------------------
 
@@ -368,7 +368,8 @@ def _sized(size: Size | None) -> Iterator[Finding]:
 
 
 def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
-    if nees is None or nees <= _MOST_NEES:
+    lost = sum(mode is Mode.LOST for mode in result.modes)
+    if nees is None or nees <= _MOST_NEES or 2 * lost > len(result.modes):  # it is said that those are not to be trusted
         return
     yield Finding(
         "covariance.optimistic",

@@ -123,6 +123,15 @@ def test_a_wrong_size_and_a_wrong_covariance_are_named_and_coloured(tmp_path, fa
         assert f" {found['truth.size'].value:.4g} times " in found["truth.size"].text
 
 
+def test_no_prior_is_blamed_for_poses_that_are_lost():
+    result = figure_eight()
+    t = result.trajectory
+    narrow = replace(result, trajectory=replace(t, covs=t.covs / 100.0))
+    lost = replace(narrow, modes=[Mode.LOST] * len(t.stamps_ns))
+    named = [{f.code for f in compute_metrics(one, CONFIG).findings} for one in (narrow, lost)]
+    assert ["covariance.optimistic" in codes for codes in named] == [True, False]
+
+
 @pytest.mark.parametrize("factor", [30.0, 0.02])
 def test_a_size_that_is_grossly_wrong_is_an_error_and_blames_no_covariance(factor):
     """Ticks taken for radians, a radius in centimetres: no sigma of an installation explains that."""
