@@ -200,6 +200,12 @@ def _swap_joints(robot: Settings, start: tuple[float, float, float]) -> None:
     wheels["left_joint"], wheels["right_joint"] = wheels["right_joint"], wheels["left_joint"]
 
 
+def _left_backwards(robot: Settings, start: tuple[float, float, float]) -> None:
+    """Of a robot that publishes neither an odometry nor a gyro: images alone tell it."""
+    robot["wheels"]["left_radius"] *= -1.0
+    robot.setdefault("recording", {}).setdefault("topics", {}).update({"odometry": "none", "imu": "none"})
+
+
 def _mirror(landmarks: Settings) -> None:
     """The sign of y changed; markers look along the mirrored direction, upright as before."""
     for landmark in landmarks["landmarks"]:
@@ -296,6 +302,7 @@ MISTAKES: dict[str, Mistake] = {
     "camera_yaw_10": _mounted(0.0, 0.0, 10.0),
     "camera_pitch_15": _mounted(0.0, 15.0, 0.0),
     "joints_swapped": Mistake(r"wheels\.sign .*right_joint: right_wheel_joint", robot=_swap_joints),
+    "left_backwards": Mistake(r"wheels\.reversed .*left_radius: (?P<value>0.*)(?#0 1)", robot=_left_backwards),
     "radius_1.1": _radius(1.1),
     "radius_2": _radius(2.0),
     "roll_over": Mistake(r"wheels\.roll_over .*: (?P<value>.*)(?#6.28 6.29)", messages={"/joint_states": _roll_over}),

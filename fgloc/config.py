@@ -58,6 +58,7 @@ class NoiseDensity(Section):
 
 
 _LEAST_SCALE = 1e-3
+_LEAST_RADIUS = 1e-6  # m: of a way per tick
 
 
 class WheelsConfig(Section):
@@ -70,8 +71,10 @@ class WheelsConfig(Section):
     )
     left_joint: str | None = Field(None, description="joint of the wheel")
     right_joint: str | None = Field(None, description="joint of the wheel")
-    left_radius: float | None = Field(None, ge=1e-6, le=2.0, description="way per unit of the angle, usually rad")
-    right_radius: float | None = Field(None, ge=1e-6, le=2.0, description="way per unit of the angle, usually rad")
+    left_radius: float | None = Field(
+        None, ge=-2.0, le=2.0, description="way per unit of the angle, usually rad; negative: it counts backwards"
+    )
+    right_radius: float | None = Field(None, ge=-2.0, le=2.0, description="likewise")
     track: float | None = Field(None, ge=1e-3, le=5.0, description="between the contact points")
     angle_range: float | None = expert(None, ge=1e-3, le=1e9, description="where the angle rolls over")
     drive: AnyDrive | None = Field(None, description="another drive (docs/drives.md)")
@@ -103,6 +106,9 @@ class WheelsConfig(Section):
 
     @model_validator(mode="after")
     def _turns(self) -> WheelsConfig:
+        for name, radius in (("left_radius", self.left_radius), ("right_radius", self.right_radius)):
+            if radius is not None and abs(radius) < _LEAST_RADIUS:
+                raise ValueError(f"{name} is {radius:g} m, expected {_LEAST_RADIUS:g} or more, or its negative")
         if abs(self.scale_omega) < _LEAST_SCALE:
             raise ValueError(
                 f"scale_omega is {self.scale_omega:g}, expected {_LEAST_SCALE:g} or more, or its negative; "

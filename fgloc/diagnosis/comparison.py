@@ -16,6 +16,7 @@ from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.pairs import Figure, RateFit, fit_rate
 from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.sensors.wheels.events import JointsEvent
+from fgloc.sensors.wheels.sensor import right_sides
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
 
 WHEELS: dict[str, Role] = {"ticks": "joints", "odometry": "odometry"}  # role by source of the motion
@@ -109,11 +110,9 @@ class Conventions:
         given = {str(r): offset for r, offset in self.config.recording.stamp_offset_s.items()}
         return {"recording.stamp_offset_s": given | {role: round(given.get(role, 0.0) - late_s, 3)}}
 
-    def exchanged_joints(self) -> dict[str, Any]:
-        """Lines that exchange the joints of left and right wheel; empty: they have no names."""
-        wheels = self.config.wheels
-        exchanged = {"wheels.left_joint": wheels.right_joint, "wheels.right_joint": wheels.left_joint}
-        return exchanged if all(exchanged.values()) else {}
+    def right_sides(self, kind: str = "exchanged") -> dict[str, Any]:
+        """Lines that undo a mistake of `WRONG_SIDES`; empty: joints have no names, or no radii."""
+        return {f"wheels.{key}": value for key, value in right_sides(kind, self.config.wheels).items()}
 
     @property
     def wheel_units(self) -> Mapping[float, str]:
@@ -166,11 +165,11 @@ class Conventions:
         scales = {"scale_v": wheels.scale_v, "scale_omega": wheels.scale_omega}
         return lines | {f"wheels.{key}": float(f"{value * factor:.6g}") for key, value in scales.items()}
 
-    def path_of_wheels(self, factor: float) -> Path | None:
-        """Motion by wheels that move and turn the robot so many times as much; None: no wheels are like this."""
+    def path_with(self, lines: Mapping[str, Any]) -> Path | None:
+        """Motion by wheels with other settings; None: no wheels are like this."""
         config = self.config
         try:
-            for key, value in self.wheel_lines(factor).items():
+            for key, value in lines.items():
                 config = with_value(config, key, value)
         except ValueError:
             return None

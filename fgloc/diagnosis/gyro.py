@@ -15,6 +15,7 @@ from fgloc.diagnosis.landmarks import distances_agree
 from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit
 from fgloc.diagnosis.signals import Path
 from fgloc.frames import homogeneous, rotation_of, sensor_pose
+from fgloc.sensors.wheels.sensor import WRONG_SIDES
 from fgloc.types import FloatArray, Severity
 
 _SHARED = 0.9  # share of a turn that another explains: one measurement
@@ -79,10 +80,12 @@ def check_wheels(found: Conventions, path: Path) -> Path:
     if found.signals.rates() is None:
         return path
     fit = found.turn_about(path, found.up * found.config.gyro.scale)
-    if fit is None or fit.share < TELLS or fit.scale.value <= 0.0:
+    if fit is None or fit.share < TELLS:
+        return _one_backwards(found, path)
+    if fit.scale.value <= 0.0:
         return path
     off_by = found.wheels_off_by(path, 1.0 / fit.scale.value)
-    other = None if off_by is None else found.path_of_wheels(off_by[0])
+    other = None if off_by is None else found.path_with(found.wheel_lines(off_by[0]))
     if off_by is None or other is None:
         return path
     factor, code, clause = off_by
@@ -95,6 +98,18 @@ def check_wheels(found: Conventions, path: Path) -> Path:
     share = Figure(1.0 / fit.scale.value, fit.scale.sigma / fit.scale.value**2)
     found.add(code, text, found.wheel_lines(factor), share)
     return other
+
+
+def _one_backwards(found: Conventions, path: Path) -> Path:
+    """Name one side of the wheels that counts backwards: the way that the wheels tell is the gyro's turn."""
+    for kind in ("left_reversed", "right_reversed"):
+        lines = found.right_sides(kind)
+        other = found.path_with(lines) if lines and path.source == "ticks" else None
+        fit = None if other is None else found.turn_about(other, found.up * found.config.gyro.scale)
+        if other is not None and fit is not None and fit.share > TELLS and fit.scale.value > 0.0:
+            found.add("wheels.reversed", f"By the gyro the wheels {WRONG_SIDES[kind]}", lines)
+            return other
+    return path
 
 
 def _text(spans: Sequence[Span]) -> str:

@@ -27,6 +27,7 @@ from fgloc.diagnosis.landmark_fits import (
 from fgloc.diagnosis.pairs import SKID, TELLS, TURN, Figure, RateFit, varied
 from fgloc.diagnosis.signals import Path, Sightings
 from fgloc.frames import homogeneous, rpy_matrix, sensor_pose
+from fgloc.sensors.wheels.sensor import WRONG_SIDES
 from fgloc.types import Finding, FloatArray, Severity
 
 _OTHERWISE = 0.25  # logarithm of a distance by which nothing is off but by its unit
@@ -44,6 +45,7 @@ _LEAST_COS = math.cos(math.radians(80.0))  # as the measurement has it
 _GAIN, _GAIN_SIGMAS = 0.05, 3.0  # of the log-likelihood of a sighting, by which another reading is named
 _BIASED = 3.0  # times the configured bias that ranges usually are: shorter ones are in another unit than it
 _ALIKE_OFF = 0.15  # logarithm by which way and turn may differ that are off by one cause
+_LOOKS_BACK_RAD = 2.0  # of a sensor: rather than two mistakes it is one, of wheels that count backwards
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
@@ -79,11 +81,17 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
     turned = Sightings(seen.times, seen.ids, seen.points @ _place(found)[:3, :3].T, seen.spatial)
     fits = [fit_sightings(one, turned).get("body") for one in (path, mirrored)]
     misfits = [math.inf if fit is None else fit.misfit for fit in fits]
+    looks_back = fits[1] is not None and abs(se2.wrap(fits[1].yaw.value)) > _LOOKS_BACK_RAD
     wheels = found.config.wheels
     if misfits[1] * _WORSE < misfits[0]:
         lines: dict[str, Any] = {"wheels.scale_omega": -wheels.scale_omega}
         if wheels.track is not None:
-            lines = found.exchanged_joints() or lines
+            lines = found.right_sides() or lines
+        backwards = found.right_sides("reversed") if path.source == "ticks" else {}
+        if backwards and looks_back:
+            text = f"By gyro and landmarks the wheels {WRONG_SIDES['reversed']}"
+            found.add("wheels.reversed", text, backwards)
+            return True
         found.add("wheels.sign", "The wheels turn in the opposite direction of gyro and landmarks, which agree", lines)
         return True
     if misfits[0] * _WORSE < misfits[1]:
@@ -105,7 +113,7 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
     fits = fit_sightings(path, as_given, turn_sigma=turn_sigma)
     if not fits:
         return None
-    without = _wheels_off(found, path, as_given, fits)
+    without = _backwards(found, path, as_given, fits) or _wheels_off(found, path, as_given, fits)
     if without is not None:
         path, fits = without
     best = _best(fits)
@@ -185,6 +193,31 @@ def _fitting(fits: Mapping[str, Mounting], seen: Sightings) -> Mounting | None:
     return None if best is None or best.misfit > _FITS * _reach(seen, best) else best
 
 
+def _backwards(
+    found: Conventions, path: Path, seen: Sightings, fits: Mapping[str, Mounting]
+) -> tuple[Path, dict[str, Mounting]] | None:
+    """Name wheels that count backwards, by the landmarks alone; path and fits without that."""
+    best, sound = _fitting(fits, seen), fits.get("body")
+    usual = sound is not None and best is not None and sound.misfit < _WORSE * best.misfit
+    if path.source != "ticks" or (usual and sound is not None and abs(sound.yaw.value) < _LOOKS_BACK_RAD):
+        return None
+    tried = []
+    for kind in ("reversed", "left_reversed", "right_reversed"):
+        lines = found.right_sides(kind)
+        other = found.path_with(lines) if lines else None
+        again = {} if other is None else fit_sightings(other, seen)
+        m = again.get("body")
+        if other is not None and m is not None and _fitting({"body": m}, seen) and _unscaled(m):
+            tried += [(m.misfit, kind, lines, other, again)] * (abs(m.yaw.value) < _LOOKS_BACK_RAD)
+    if not tried:
+        return None
+    misfit, kind, lines, other, again = min(tried, key=lambda one: one[0])
+    if best is not None and misfit > _WORSE * best.misfit:
+        return None
+    found.add("wheels.reversed", f"By the landmarks the wheels {WRONG_SIDES[kind]}", lines)
+    return other, again
+
+
 def _wheels_off(
     found: Conventions, path: Path, seen: Sightings, fits: Mapping[str, Mounting]
 ) -> tuple[Path, dict[str, Mounting]] | None:
@@ -234,7 +267,7 @@ def _alike(m: Mounting) -> bool:
 
 def _of_wheels(found: Conventions, seen: Sightings, factor: float) -> tuple[Path, dict[str, Mounting], Mounting] | None:
     """Path of wheels that turn so many times as much, and the fits of sightings to it; None: landmarks wander."""
-    path = found.path_of_wheels(factor)
+    path = found.path_with(found.wheel_lines(factor))
     fits = None if path is None else fit_sightings(path, seen)
     best = _fitting(fits, seen) if fits else None
     return None if path is None or not fits or best is None else (path, fits, best)

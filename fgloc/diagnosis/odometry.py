@@ -12,7 +12,7 @@ from fgloc.diagnosis.comparison import WHEELS, Conventions, unit_of
 from fgloc.diagnosis.pairs import FOLLOWS, ROUGHLY, SKID, TELLS, VARIED, Figure, fit_rate, fit_way, irls, weighted
 from fgloc.diagnosis.signals import SILENT_S, Path, in_order, turn_by
 from fgloc.sensors.wheels.naming import goes_sideways
-from fgloc.sensors.wheels.sensor import settings_of
+from fgloc.sensors.wheels.sensor import WRONG_SIDES, settings_of
 from fgloc.types import ControlEvent, FloatArray, Severity
 
 _ASIDE = 0.1  # share of the way that is sideways: the lateral part of a turn about a sensor is less
@@ -222,6 +222,9 @@ def check_sideways(found: Conventions, path: Path) -> None:
             return
 
 
+_BACKWARDS = {(True, True): "reversed", (True, False): "left_reversed", (False, True): "right_reversed"}
+
+
 def check_angles(found: Conventions, path: Path) -> Path:
     """Compare signs and unit of the wheels' angles with the driver's odometry; the path with what is wrong undone."""
     driver = found.signals.odometry_path()
@@ -235,8 +238,12 @@ def check_angles(found: Conventions, path: Path) -> Path:
         gyro = found.turn_about(path, found.up * found.config.gyro.scale)
         if gyro is not None and gyro.share > TELLS and gyro.scale.value > 0.0:
             return path  # the odometry is wrong, and not used
-    fitted, radius = settings_of(found.signals.motion), wheels.left_radius
-    ratio = 1.0 if fitted is None or radius is None else fitted["left_radius"] / radius
+    fitted, (left, right) = settings_of(found.signals.motion), (wheels.left_radius, wheels.right_radius)
+    ratios = (1.0, 1.0)
+    if fitted is not None and left and right and wheels.left_joint in (None, fitted["left_joint"]):
+        ratios = fitted["left_radius"] / left, fitted["right_radius"] / right
+    backwards = _BACKWARDS.get((ratios[0] < 0.0, ratios[1] < 0.0), "reversed" if factor < 0.0 else "")
+    ratio = abs(ratios[0])
     unit = found.in_wheel_unit(path, ratio, ROUGHLY)
     if unit is not None:
         text = (
@@ -244,12 +251,12 @@ def check_angles(found: Conventions, path: Path) -> Path:
             "its odometry"
         )
         found.add("wheels.unit", text, found.wheel_lines(unit[0]), Figure(1.0 / ratio, 0.0))
-    elif factor < 0.0:
-        text = "The wheels' angles count backward when the robot goes forward, by the driver's odometry"
-        found.add("wheels.reversed", text, {"wheels.source": "pose"})
+    elif backwards:
+        text = f"By the driver's odometry the wheels {WRONG_SIDES[backwards]}"
+        found.add("wheels.reversed", text, found.right_sides(backwards) or {"wheels.source": "pose"})
     elif turns < 0.0:
         text = "The wheels' angles turn the other way than the driver's odometry: left and right are exchanged"
-        found.add("wheels.sign", text, found.exchanged_joints())
+        found.add("wheels.sign", text, found.right_sides())
     else:
         return path
     return found.signals.path(found.config) or path

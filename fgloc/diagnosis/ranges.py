@@ -269,9 +269,9 @@ def _told(found: Conventions) -> set[str]:
 def _turn(found: Conventions, turn: Figure) -> None:
     wheels, size = found.config.wheels, abs(turn.value)
     lines: dict[str, Any] = {"wheels.scale_omega": round(wheels.scale_omega * turn.value, 4)}
-    if wheels.track is not None and (turn.value > 0.0 or found.exchanged_joints()):
+    if wheels.track is not None and (turn.value > 0.0 or found.right_sides()):
         lines = {"wheels.track": round(wheels.track / size, 4)}
-        lines |= found.exchanged_joints() if turn.value < 0.0 else {}
+        lines |= found.right_sides() if turn.value < 0.0 else {}
     much = f"{size:.3f} ± {turn.sigma:.2g} times as much as by its wheels"
     why = "the distance of the wheels is wrong" if turn.value > 0.0 else ""
     if turn.value < 0.0:

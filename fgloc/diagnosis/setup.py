@@ -99,6 +99,10 @@ def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Itera
     yield Change("track", setup, {"track": _WIDE})
     for kind, signs in (("exchanged", (1, 1, -1)), ("reversed", (-1, -1, -1)), ("both_reversed", (-1, -1, 1))):
         yield Change(kind, replace(setup, turned=np.diag(np.array(signs, dtype=float))))
+    if source == "ticks" and (track := setup.config.wheels.track) is not None:
+        for kind, sign in (("left_reversed", 1.0), ("right_reversed", -1.0)):  # what is told as a way is a turn
+            turned_by = np.array([[0.0, 0.0, 0.5 * track], [0.0, 1.0, 0.0], [2.0 / track, 0.0, 0.0]])
+            yield Change(kind, replace(setup, turned=sign * turned_by))
     if source == "odometry":
         yield from (Change("odometry_frame", replace(setup, turned=_about_z(d))) for d in (90.0, -90.0, 180.0))
 

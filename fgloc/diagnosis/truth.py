@@ -226,7 +226,7 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
 def _wheels_off(found: Conventions, path: Path, own: FloatArray, fit: BodyFit) -> tuple[Path, BodyFit]:
     """Name wheels in another unit, before a gear or of other radii, by way and turn alike; path and fit without it."""
     off_by = found.wheels_off_by(path, fit.turns.value)
-    other = None if off_by is None else found.path_of_wheels(off_by[0])
+    other = None if off_by is None else found.path_with(found.wheel_lines(off_by[0]))
     again = None if other is None else fit_body(other, own)
     if off_by is None or other is None or again is None or abs(math.log(again.scale.value)) > _WHEELS_OFF:
         return path, fit

@@ -368,8 +368,8 @@ def _sized(size: Size | None) -> Iterator[Finding]:
 
 
 def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
-    lost = sum(mode is Mode.LOST for mode in result.modes)
-    if nees is None or nees <= _MOST_NEES or 2 * lost > len(result.modes):  # it is said that those are not to be trusted
+    lost = sum(mode is Mode.LOST for mode in result.modes)  # no sigma of a prior makes these right
+    if nees is None or nees <= _MOST_NEES or 2 * lost > len(result.modes):
         return
     yield Finding(
         "covariance.optimistic",

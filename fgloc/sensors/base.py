@@ -473,6 +473,7 @@ class Sensor(Protocol):
 # --- inputs of motion models ------------------------------------------------------------------------------------------
 
 _Positive = Annotated[FiniteFloat, Field(gt=0)]
+_Radius = Annotated[FiniteFloat, Field(description="m, negative: it counts backwards; for the input wheels")]
 
 
 class WheelJoints(Section):
@@ -480,8 +481,8 @@ class WheelJoints(Section):
 
     left: str | None = Field(None, description="joint of the left wheel; None: the one named so")
     right: str | None = None
-    left_radius: _Positive | None = Field(None, description="m; the input wheels needs it")
-    right_radius: _Positive | None = None
+    left_radius: _Radius | None = None
+    right_radius: _Radius | None = None
     track: _Positive | None = None
 
     @property

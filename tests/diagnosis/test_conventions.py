@@ -55,6 +55,7 @@ class Broken:
     imu_late: float = 0.0
     joint_rate: float = 0.0  # of wheels that report rates, in place of an odometry; 0: none do
     joint_angle: float = 0.0  # of a joint over the wheel's
+    joint_signs: tuple[float, float] = (1.0, 1.0)
     speed: float = 1.0
     yaw_rate: float = 1.0
     turn: float = 1.0
@@ -91,7 +92,7 @@ def record(folder: Path, wrong: Broken) -> Path:
                 twist = (SPEED[k], 0.0, wrong.turn * RATE[k])
             if wrong.joint_angle:
                 ways = (STEP_S * SPEED[:k].sum() + side * 0.5 * TRACK * YAW[k] for side in (-1.0, 1.0))
-                angles = [wrong.joint_angle * way / RADIUS for way in ways]
+                angles = [c * wrong.joint_angle * way / RADIUS for c, way in zip(wrong.joint_signs, ways, strict=True)]
                 messages.append(
                     (received, lambda s=stamp, a=angles, r=received: bag.joints("/joints", s, WHEELS, a, (), (), r))
                 )
@@ -255,6 +256,20 @@ def test_wheels_before_a_gear_or_of_other_radii_are_named_and_nothing_else(tmp_p
     assert [f.code for f in found] == ["wheels.gear"]
     if found[0].lines:  # the truth judges the wheels in sentences only
         assert float(found[0].lines["wheels.left_radius"]) == pytest.approx(RADIUS / gear, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("signs", "without"),
+    [((-1, -1), ()), ((-1, -1), ("imu",)), ((1, -1), ("sightings",)), ((1, -1), ("imu", "truth")), ((-1, 1), ())],
+)
+def test_wheels_that_count_backwards_are_named_and_nothing_else(tmp_path, signs, without):
+    """A motor that is mounted the other way round is one mistake, and not a mirrored sensor that looks backward."""
+    bag = record(tmp_path, Broken(joint_angle=1.0, joint_signs=signs))
+    config = config_of({"recording": {"topics": dict.fromkeys(without, "none")}, "wheels": GEOMETRY})
+    (found,) = (f for f in conventions_of(bag, config) if f.code.split(".")[0] in COMPARED)
+    assert found.code == "wheels.reversed"
+    sides = {"left": signs[0], "right": signs[1]}
+    assert found.lines == {f"wheels.{side}_radius": f"{-RADIUS:g}" for side, sign in sides.items() if sign < 0}
 
 
 def test_a_truth_that_is_no_unit_is_not_fitted_to_wheels_of_wrong_radii_and_track(tmp_path):

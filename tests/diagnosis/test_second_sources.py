@@ -67,9 +67,13 @@ def test_angles_in_degrees(found, config):
     )
 
 
-def test_angles_that_count_backward(found):
-    (finding,) = found(JointsEvent, turned(-1.0))
-    assert (finding.code, finding.lines["wheels.source"]) == ("wheels.reversed", "pose")
+@pytest.mark.parametrize("signs", [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0)])
+def test_angles_that_count_backward(found, config, signs):
+    (finding,) = found(JointsEvent, turned(np.array(signs)))
+    radii = config.wheels.left_radius, config.wheels.right_radius
+    sides = zip(("left", "right"), radii, signs, strict=True)
+    assert finding.code == "wheels.reversed"
+    assert finding.lines == {f"wheels.{side}_radius": f"{-radius:g}" for side, radius, c in sides if c < 0.0}
 
 
 def test_exchanged_wheels_by_the_odometry(found, config):

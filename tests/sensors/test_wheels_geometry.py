@@ -1,6 +1,7 @@
 """Which joints are wheels, by their names, and their radius and track, by an odometry."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,11 +61,20 @@ def driven(by_pose, heading_off=0.0):
 @pytest.mark.parametrize("by_pose", [True, False])
 def test_radius_and_track_are_those_that_the_driver_sums_its_pose_up_with(by_pose):
     found = fit_geometry(WheelPair("left_wheel", "right_wheel"), *driven(by_pose))
-    assert found.radius_m == pytest.approx(RADIUS, rel=0.005)
+    assert found.radii_m == pytest.approx((RADIUS, RADIUS), rel=0.005)
+    assert found.track_m == pytest.approx(TRACK, rel=0.01)
+
+
+@pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
+def test_a_wheel_that_counts_backwards_has_a_negative_radius(signs):
+    events, heard = driven(True)
+    events = [replace(e, position=e.position * signs) for e in events]
+    found = fit_geometry(WheelPair("left_wheel", "right_wheel"), events, heard)
+    assert found.radii_m == pytest.approx((signs[0] * RADIUS, signs[1] * RADIUS), rel=0.005)
     assert found.track_m == pytest.approx(TRACK, rel=0.01)
 
 
 def test_a_pose_whose_heading_is_not_its_way_tells_no_radius():
     found = fit_geometry(WheelPair("left_wheel", "right_wheel"), *driven(True, heading_off=0.2))
-    assert found.radius_m == pytest.approx(RADIUS, rel=0.005)
+    assert found.radii_m == pytest.approx((RADIUS, RADIUS), rel=0.005)
     assert found.track_m == pytest.approx(TRACK, rel=0.01)

@@ -118,17 +118,20 @@ class WheelPair:
     right: str
 
 
+_SIGNS = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))  # of counts of the left and the right wheel
+
+
 @dataclass(frozen=True, slots=True)
 class WheelGeometry:
     """Nominal values [m], as the robot's driver has them.
 
     Attributes:
-        radius_m: of both wheels.
+        radii_m: of the left and the right wheel, alike; negative where the joint counts backwards.
         track_m: between them.
         by_commands: the track is that of the commands: the odometry's turn is not the wheels'.
     """
 
-    radius_m: float
+    radii_m: tuple[float, float]
     track_m: float
     by_commands: bool = False
 
@@ -175,14 +178,18 @@ def fit_geometry(
             continue
         path = np.stack([np.interp(seconds, at, gone[:, k]) for k in range(2)], axis=1)
         rates, means = (((x[later] - x)[whole] / lasted[whole, None]) for x in (angles, path))
-        difference = rates[:, 1] - rates[:, 0]
-        radius = _slope(rates.mean(axis=1), means[:, 0])
-        per_difference = _slope(difference, means[:, 1]) if means[:, 1].std() > _LEAST_TURNING else None
-        if radius is not None and per_difference is not None:
-            return WheelGeometry(radius, radius / per_difference)
-        commanded = _commanded(np.asarray(seconds[whole] + origin_ns * 1e-9), difference, commands)
-        if by_commands is None and radius is not None and commanded is not None:
-            by_commands = WheelGeometry(radius, radius / commanded, by_commands=True)
+        for signs in _SIGNS:
+            left, right = (rates * signs).T
+            radius = _slope(0.5 * (left + right), means[:, 0])
+            if radius is None:
+                continue
+            radii = (radius * signs[0], radius * signs[1])
+            per_difference = _slope(right - left, means[:, 1]) if means[:, 1].std() > _LEAST_TURNING else None
+            if per_difference is not None:
+                return WheelGeometry(radii, radius / per_difference)
+            commanded = _commanded(np.asarray(seconds[whole] + origin_ns * 1e-9), right - left, commands)
+            if by_commands is None and commanded is not None:
+                by_commands = WheelGeometry(radii, radius / commanded, by_commands=True)
     return by_commands
 
 
@@ -247,13 +254,13 @@ def settings_of(events: Sequence[Event]) -> dict[str, Any] | None:
     )
     if pair is None or found is None:
         return None
-    radius = float(f"{found.radius_m:.4g}")
+    left, right = (float(f"{radius:.4g}") for radius in found.radii_m)
     return {
         "source": "ticks",
         "left_joint": pair.left,
         "right_joint": pair.right,
-        "left_radius": radius,
-        "right_radius": radius,
+        "left_radius": left,
+        "right_radius": right,
         "track": float(f"{found.track_m:.4g}"),
     }
 
@@ -338,8 +345,8 @@ def _found(pair: WheelPair, geometry: WheelGeometry) -> tuple[str, ...]:
         "  source: ticks",
         f"  left_joint: {pair.left}",
         f"  right_joint: {pair.right}",
-        f"  left_radius: {geometry.radius_m:.4g}  # m",
-        f"  right_radius: {geometry.radius_m:.4g}",
+        f"  left_radius: {geometry.radii_m[0]:.4g}  # m; negative: it counts backwards",
+        f"  right_radius: {geometry.radii_m[1]:.4g}",
         f"  track: {geometry.track_m:.4g}  # m, between the wheels' contact points",
         "  # scale_sigma: 0.01  # how far the radii may be off; fgloc calibrate finds by how much they are",
     )
@@ -377,7 +384,7 @@ class SetupMistake:
     """Mistake in the odometer's settings, as an excerpt of a recording shows it.
 
     Attributes:
-        kind: ``radius``, ``track``, ``odometry_frame``, ``exchanged``, ``reversed`` or ``both_reversed``.
+        kind: ``radius``, ``track``, ``odometry_frame``, or a key of `WRONG_SIDES`.
         factor: of radius and track: true over given.
         turned: of the others: what brings its twist ``(3,)`` into the base's axes, ``(3, 3)``.
         source: of its motion, as `Odometer.source` has it.
@@ -428,27 +435,44 @@ def _radius(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
     return RawMistake("wheels.scale", sentence, "wheels", new)
 
 
+WRONG_SIDES = {
+    "exchanged": "turn the robot the other way (left and right exchanged)",
+    "reversed": "count backwards",
+    "both_reversed": "count backwards, and left and right are exchanged",
+    "left_reversed": "count backwards on the left side",
+    "right_reversed": "count backwards on the right side",
+}
+"""Joints of the wheels that are on the wrong side or count backwards, by kind of mistake, in words."""
+
+
+def right_sides(kind: str, wheels: WheelsConfig) -> dict[str, Any]:
+    """Settings of joints that undo a mistake of `WRONG_SIDES`; empty: names or radii are not configured."""
+    joints = {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint}
+    exchanged = joints if None not in joints.values() else {}
+    if kind == "exchanged":
+        return exchanged
+    if wheels.left_radius is None or wheels.right_radius is None or (kind == "both_reversed" and not exchanged):
+        return {}
+    new: dict[str, Any] = dict(exchanged) if kind == "both_reversed" else {}
+    if kind != "right_reversed":
+        new["left_radius"] = -wheels.left_radius
+    if kind != "left_reversed":
+        new["right_radius"] = -wheels.right_radius
+    return new
+
+
 def _sides(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    """Sentence on wheels with left and right, or forward and backward, exchanged, and the settings that correct it."""
-    if mistake.source == "ticks" and mistake.kind == "exchanged" and wheels.left_joint and wheels.right_joint:
-        sentence = (
-            "The left and the right wheel are exchanged: set wheels.left_joint: "
-            f"{wheels.right_joint} and wheels.right_joint: {wheels.left_joint}."
-        )
-        swapped = {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint}
-        return RawMistake("wheels.sign", sentence, "wheels", swapped)
-    how = {
-        "exchanged": "turn the robot the other way (left and right exchanged)",
-        "reversed": "turn backward when the robot goes forward",
-        "both_reversed": "turn backward when the robot goes forward, and left and right are exchanged",
-    }[mistake.kind]
-    line = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
+    """Sentence on wheels with sides exchanged or counts reversed, and the settings that correct it."""
+    new = right_sides(mistake.kind, wheels) if mistake.source == "ticks" else {}
+    by_hand = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
+    line = f"set {_lines(new)}" if new else by_hand
     code = "wheels.sign" if mistake.kind == "exchanged" else "wheels.reversed"
-    return RawMistake(code, f"The wheels {how}: {line}.", "wheels", {})
+    return RawMistake(code, f"The wheels {WRONG_SIDES[mistake.kind]}: {line}.", "wheels", new)
 
 
-def _lines(values: Mapping[str, float]) -> str:
-    return " and ".join(f"wheels.{name}: {value:.4g}" for name, value in values.items())
+def _lines(values: Mapping[str, Any]) -> str:
+    shown = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in values.items()}
+    return " and ".join(f"wheels.{name}: {value}" for name, value in shown.items())
 
 
 _JUMP = 8.0  # times a usual step of a wheel's angle, and ...
