@@ -196,6 +196,7 @@ def _of_points(bag: Path, out: Path, settings: Config, config: Path | None) -> N
     """A map of points, from ranges and bearings or marker poses; ``config``: the file that was given."""
     from fgloc.runner import run
     from fgloc.sensors.maps import write_map
+    from fgloc.types import Severity, ordered
 
     with run_bar("map") as progress:
         result = run(bag, None, settings, "batch", progress)
@@ -203,8 +204,11 @@ def _of_points(bag: Path, out: Path, settings: Config, config: Path | None) -> N
         raise RecordingError(f"{bag}: no landmark was seen often enough to be surveyed; see `fgloc info {bag}`")
     write_map(result.landmarks, out)
     say(f"{len(result.landmarks)} landmarks in {out}")
-    _tell_next([bag], out, config)
+    for finding in ordered(result.findings):
+        if finding.severity is Severity.ERROR:
+            say_remark("error", finding.text, err=True)
     exit_unless_trusted(result)
+    _tell_next([bag], out, config)
 
 
 def _of_anchors(bag: Path, out: Path, settings: Config, config: Path | None) -> None:

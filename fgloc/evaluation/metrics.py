@@ -225,6 +225,7 @@ def coverage(errors: FloatArray, covs: FloatArray, k: float) -> float:
 _MOST_NEES = 3.0  # NEES/3: errors of √3 = 1.7 times what the covariance says; sound runs as installed stay below 2
 _MOST_DROPPED = 0.2  # share of a sensor's messages
 _FEWEST = 20  # dropped ones
+_UNUSED = 0.9  # share of the steps without a model's prediction
 _ORIGIN = 1e-3  # m and rad: no run on a map begins at its origin so exactly
 _PRIOR = re.compile(r"(position|scale)_sigma")  # of a section's settings, the one that says most of its installation
 _SETTINGS = {  # of a sensor whose messages are dropped
@@ -260,7 +261,8 @@ def all_findings(
     gross = size is not None and size.gross
     judged = [frame] if frame is not None else [] if gross else _optimistic(result, nees_over_3)
     misjudged = [finding for finding in judged if finding.code not in known]
-    return ordered([*_timed(result), *_sized(size), *misjudged, *_dropped(result, rejections, keyframes)])
+    dropped = [*_dropped(result, rejections, keyframes), *_unused(rejections, keyframes)]
+    return ordered([*_timed(result), *_sized(size), *misjudged, *dropped])
 
 
 def _timed(result: RunData) -> list[Finding]:
@@ -276,11 +278,14 @@ def _timed(result: RunData) -> list[Finding]:
 
 
 def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | None:
-    """Finding that the truth is not in the frame of a run without a map: of its first pose, of anchors or positions."""
+    """Finding that the truth is not in the frame of the run: of its first pose, of anchors or positions, of a map.
+
+    On a map a trajectory that a motion lays onto the truth is a right one, unless the robot was lost.
+    """
     at_origin = np.allclose(result.trajectory.poses[0], 0.0, atol=_ORIGIN)
-    placed = result.landmarks is not None and not len(result.landmarks)  # by anchors or positions
+    lost = sum(mode is Mode.LOST for mode in result.modes) > _LOST * len(result.modes)
     nowhere = any(finding.code == "map.unused" for finding in result.findings)  # poses are not in the map's frame
-    if nowhere or config.estimator.initial_pose is not None or not (at_origin or placed):
+    if nowhere or config.estimator.initial_pose is not None or (lost and not at_origin):
         return None
     times = (matched.stamps_ns - matched.stamps_ns[0]) * 1e-9
     sentence = truth_sentence(config, np.column_stack([times, matched.truth]), times, matched.estimate)
@@ -306,6 +311,7 @@ def _turned(config: Config, matched: Matched) -> Finding | None:
     return Finding("truth.mounting", text, Severity.WARNING, {"truth.yaw_offset_rad": f"{offset:g}"}, -mean, spread)
 
 
+_LOST = 0.1  # share of the poses
 _TURNED_RAD = 0.1  # yaw of a truth that is worth a word
 _AGREE = 0.25  # largest error of positions over the path's extent, and spread of the yaw over what it is off by
 
@@ -406,6 +412,19 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
             yield Finding(f"{sensor}.dropped", text, Severity.WARNING if used else Severity.NOTE, value=float(count))
 
 
+def _unused(rejections: Mapping[str, int], keyframes: int) -> Iterator[Finding]:
+    """Finding on a motion model that a run was given and never used."""
+    why = {reason: n for reason, n in rejections.items() if reason.startswith("learned.")}
+    without = rejections.get("learned.no_commands", 0)
+    if sum(why.values()) < _UNUSED * keyframes or without < _FEWEST:
+        return
+    text = (
+        f"The motion model was not used: for {without} of {keyframes} steps the recording has no commands that it "
+        "reads. Set recording.topics.command, or leave the model out."
+    )
+    yield Finding("learned.unused", text, Severity.WARNING, value=float(without))
+
+
 def _settings_of(sensor: str, result: RunData) -> str:
     """Settings that decide which messages of a sensor are dropped; of sightings, by what this run's are."""
     kind = base_role(sensor)
@@ -425,6 +444,11 @@ def _prior_sigmas(result: RunData) -> str:
     if found is not None and found.landmarks is not None:
         sections.insert(0, "map")
     names = []
+    if result.config is not None and result.config.wheels.drive is not None and "wheels" in sections:
+        sections = [section for section in sections if section != "wheels"]
+        names.append("wheels.drive.sigmas")
+    if found is not None and result.landmarks is None:
+        names.append("expert.wheels.noise (fgloc calibrate takes several recordings)")
     for section in dict.fromkeys(sections):
         field = Config.model_fields.get(section)  # "stamp_offset_s" is of the clocks
         keys = () if field is None else getattr(field.annotation, "model_fields", ())

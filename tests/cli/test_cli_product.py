@@ -28,6 +28,7 @@ from fgloc.config import Config, WheelsConfig, config_of, load_config
 from fgloc.evaluation.metrics import all_findings, compute_metrics
 from fgloc.recording.info import inspect
 from fgloc.runner import run
+from fgloc.sensors.maps import load_map, write_map
 from fgloc.types import Decision, Finding, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import load_train_config
@@ -549,6 +550,18 @@ def test_a_truth_in_another_frame_is_named_and_blames_no_covariance(tmp_path):
         findings = json.loads((tmp_path / align / "metrics.json").read_text())["findings"]
         assert {f["code"] for f in findings if f["severity"] != "note"} == codes
         assert [f["lines"] for f in findings if f["code"] == "truth.frame"] == [{"truth.align": "se2"}] * len(codes)
+
+
+def test_a_map_in_another_frame_than_the_truth_is_named_and_blames_no_covariance(tmp_path):
+    """As of a map that `fgloc map` made of another drive: its frame is that of the drive's first pose."""
+    bag = write_circle(tmp_path, seconds=15.0)
+    given = load_map(tmp_path / "map.yaml")
+    moved = {i: replace(lm, position=lm.position + np.array([3.0, -2.0, 0.0])) for i, lm in given.landmarks.items()}
+    write_map(replace(given, landmarks=moved), tmp_path / "map.yaml")
+    assert fgloc("smooth", bag, "--map", tmp_path / "map.yaml", "--out", tmp_path / "moved")[0] == 0
+    findings = json.loads((tmp_path / "moved" / "metrics.json").read_text())["findings"]
+    told = {f["code"]: f["lines"] for f in findings if f["severity"] != "note"}
+    assert told == {"truth.frame": {"truth.align": "se2"}}
 
 
 def test_a_truth_whose_body_is_turned_is_named_in_a_short_run_too_and_blames_no_covariance(tmp_path):

@@ -7,8 +7,29 @@ import pytest
 from robot_world import CAMERA
 from run_results import figure_eight
 
+from fgloc.config import config_of
 from fgloc.evaluation.metrics import all_findings
-from fgloc.types import InstallationFound
+from fgloc.types import InstallationFound, Setting
+
+
+def test_the_prior_of_a_drive_is_that_of_its_section_and_dead_reckoning_has_noise():
+    settings = (Setting("wheels.drive.half_sum", 0.35, 0.35, 0.01, 0.01),)
+    found = InstallationFound((), np.zeros(0), np.eye(0), np.eye(0), (), "", "joints", settings)
+    config = config_of(
+        {"wheels": {"drive": {"kind": "mecanum", "wheels": list("abcd"), "half_sum": 0.35, "radius": 0.05}}}
+    )
+    result = replace(figure_eight(), found=found, config=config, landmarks=None)
+    (said,) = [f.text for f in all_findings(result, 9.0, {}, 50) if f.code == "covariance.optimistic"]
+    assert "wheels.drive.sigmas" in said
+    assert "expert.wheels.noise" in said
+    assert "wheels.scale_sigma" not in said
+
+
+def test_a_motion_model_that_reads_no_command_is_named():
+    result = figure_eight()
+    n = len(result.trajectory)
+    codes = [{f.code for f in all_findings(result, None, {"learned.no_commands": k}, n)} for k in (n, n // 2)]
+    assert ["learned.unused" in each for each in codes] == [True, False]
 
 
 @pytest.mark.parametrize(("cameras", "section"), [((CAMERA,), "markers."), ((), "landmarks.")])
