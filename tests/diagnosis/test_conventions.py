@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from command_line import fgloc
 from event_makers import odometry
 
 from fgloc.calibration.first_settings import first_settings, with_findings
@@ -270,6 +271,16 @@ def test_wheels_that_count_backwards_are_named_and_nothing_else(tmp_path, signs,
     assert found.code == "wheels.reversed"
     sides = {"left": signs[0], "right": signs[1]}
     assert found.lines == {f"wheels.{side}_radius": f"{-RADIUS:g}" for side, sign in sides.items() if sign < 0}
+
+
+def test_a_map_surveyed_with_wrong_wheels_is_followed_by_the_reason_and_no_next_step(tmp_path):
+    bag = record(tmp_path, Broken(joint_angle=1.0, joint_signs=(-1.0, 1.0)))
+    (tmp_path / "map.yaml").unlink()
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump({"wheels": GEOMETRY}))
+    code, stdout, err = fgloc("map", bag, "--out", tmp_path / "found.yaml")
+    assert code == 3
+    assert "left_radius: -0.05" in next(line for line in err.splitlines() if line.startswith("error: "))
+    assert "next:" not in stdout
 
 
 def test_a_truth_that_is_no_unit_is_not_fitted_to_wheels_of_wrong_radii_and_track(tmp_path):
