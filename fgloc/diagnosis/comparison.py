@@ -187,12 +187,20 @@ class Conventions:
         figure: Figure | None = None,
         severity: Severity = Severity.ERROR,
     ) -> None:
-        """Note a finding, and set its lines."""
+        """Note a finding, and set its lines; a key that an earlier one has set is the newer one's, built on it."""
         lines = lines or {}
         shown = {setting(key): one_line(value) for key, value in lines.items()}
         value, sigma = (None, None) if figure is None else (figure.value, figure.sigma)
-        remedy = "; ".join(f"set {key}: {value}" for key, value in shown.items())
-        self.findings.append(Finding(code, f"{text}{': ' + remedy if remedy else ''}.", severity, shown, value, sigma))
+        for k, earlier in enumerate(self.findings):
+            if earlier.lines.keys() & shown.keys():
+                left = {key: line for key, line in earlier.lines.items() if key not in shown}
+                fact = earlier.text.removesuffix(_remedy(earlier.lines))
+                self.findings[k] = replace(earlier, text=fact + _remedy(left), lines=left)
+        self.findings.append(Finding(code, text + _remedy(shown), severity, shown, value, sigma))
         for key, given in lines.items():
             with suppress(ValueError):  # beyond what a setting may be: it is said, and left as it is
                 self.config = with_value(self.config, key, given)
+
+
+def _remedy(lines: Mapping[str, str]) -> str:
+    return f"{': ' if lines else ''}{'; '.join(f'set {key}: {line}' for key, line in lines.items())}."

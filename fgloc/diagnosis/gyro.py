@@ -102,13 +102,17 @@ def check_wheels(found: Conventions, path: Path) -> Path:
 
 def _one_backwards(found: Conventions, path: Path) -> Path:
     """Name one side of the wheels that counts backwards: the way that the wheels tell is the gyro's turn."""
+    up, rates = found.up * found.config.gyro.scale, found.signals.rates()
+    gravity = None if rates is None else _gravity_axis(rates[2])
+    if gravity is not None and gravity @ up < -0.5 * abs(found.config.gyro.scale):
+        up = -up  # an IMU that hangs upside down, which is named besides
     for kind in ("left_reversed", "right_reversed"):
         lines = found.right_sides(kind)
         other = found.path_with(lines) if lines and path.source == "ticks" else None
-        fit = None if other is None else found.turn_about(other, found.up * found.config.gyro.scale)
+        fit = None if other is None else found.turn_about(other, up)
         if other is not None and fit is not None and fit.share > TELLS and fit.scale.value > 0.0:
             found.add("wheels.reversed", f"By the gyro the wheels {WRONG_SIDES[kind]}", lines)
-            return other
+            return check_wheels(found, other)
     return path
 
 

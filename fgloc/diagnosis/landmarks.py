@@ -113,11 +113,19 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
     fits = fit_sightings(path, as_given, turn_sigma=turn_sigma)
     if not fits:
         return None
-    without = _backwards(found, path, as_given, fits) or _wheels_off(found, path, as_given, fits)
-    if without is not None:
-        path, fits = without
+    for look in (_backwards, _wheels_off):
+        without = look(found, path, as_given, fits)
+        if without is not None:
+            path, fits = without
     best = _best(fits)
     reach = _reach(as_given, best)
+    if path.source == "ticks" and best.misfit < _FITS * reach and best.turns.off(1.0, 1.0 - math.exp(-GEAR)):
+        scale_omega = round(found.config.wheels.scale_omega * best.turns.value, 4)
+        text = (
+            f"By the landmarks the robot turns {best.turns.value:.3g} ± {best.turns.sigma:.2g} times as much as its "
+            "wheels say (a track that is not the robot's, or skidding wheels)"
+        )
+        found.add("wheels.turn", text, {"wheels.scale_omega": scale_omega}, best.turns)
     if best.misfit > _FITS * reach:
         return None  # nothing fits: the landmarks move, or the wheels slip throughout
     if best.scale.sigma > 0.3 * best.scale.value:  # too few landmarks, or the robot hardly moved
@@ -207,7 +215,7 @@ def _backwards(
         other = found.path_with(lines) if lines else None
         again = {} if other is None else fit_sightings(other, seen)
         m = again.get("body")
-        if other is not None and m is not None and _fitting({"body": m}, seen) and _unscaled(m):
+        if other is not None and m is not None and _fitting({"body": m}, seen) and (_unscaled(m) or _alike(m)):
             tried += [(m.misfit, kind, lines, other, again)] * (abs(m.yaw.value) < _LOOKS_BACK_RAD)
     if not tried:
         return None

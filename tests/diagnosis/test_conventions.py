@@ -273,6 +273,26 @@ def test_wheels_that_count_backwards_are_named_and_nothing_else(tmp_path, signs,
     assert found.lines == {f"wheels.{side}_radius": f"{-RADIUS:g}" for side, sign in sides.items() if sign < 0}
 
 
+@pytest.mark.parametrize("without", [("truth",), ("imu", "truth")])
+def test_a_side_that_counts_backwards_before_a_gear_has_one_line_for_each_radius(tmp_path, without):
+    bag = record(tmp_path, Broken(joint_angle=3.0, joint_signs=(-1.0, 1.0)))
+    config = config_of({"recording": {"topics": dict.fromkeys(without, "none")}, "wheels": GEOMETRY})
+    backwards, gear = (f for f in conventions_of(bag, config) if f.code.split(".")[0] in COMPARED)
+    assert [backwards.code, gear.code] == ["wheels.reversed", "wheels.gear"]
+    assert not backwards.lines
+    radii = [float(gear.lines[f"wheels.{side}_radius"]) for side in ("left", "right")]
+    assert radii == pytest.approx([-RADIUS / 3.0, RADIUS / 3.0], rel=0.01)
+
+
+def test_a_wrong_track_is_named_by_landmarks_alone(tmp_path):
+    bag = record(tmp_path, Broken(joint_angle=1.0))
+    topics = {"imu": "none", "truth": "none"}
+    config = config_of({"recording": {"topics": topics}, "wheels": GEOMETRY | {"track": 0.5 * TRACK}})
+    (found,) = (f for f in conventions_of(bag, config) if f.code.split(".")[0] in COMPARED)
+    assert found.code == "wheels.turn"
+    assert float(found.lines["wheels.scale_omega"]) == pytest.approx(0.5, rel=0.01)
+
+
 def test_a_map_surveyed_with_wrong_wheels_is_followed_by_the_reason_and_no_next_step(tmp_path):
     bag = record(tmp_path, Broken(joint_angle=1.0, joint_signs=(-1.0, 1.0)))
     (tmp_path / "map.yaml").unlink()
