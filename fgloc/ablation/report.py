@@ -39,6 +39,7 @@ class Metric:
     label: str
     factor: float = 1.0  # from the SI value to what is shown
     form: str = ".3g"
+    most: float = math.inf  # largest possible value in shown units; the smallest is 0
 
     def of(self, record: Record) -> float | None:
         """The record's value in shown units; None if it has none."""
@@ -54,10 +55,11 @@ METRICS = (
     Metric("yaw_mae_deg", "yaw MAE [°]", 1.0, ".3g"),
     Metric("drift_percent", "drift [%]", 1.0, ".3g"),
     Metric("nees_over_3", "NEES / 3", 1.0, ".2f"),
-    Metric("coverage.3", "within 3σ [%]", 100.0, ".1f"),
+    Metric("coverage.3", "within 3σ [%]", 100.0, ".1f", 100.0),
 )
 ATE = METRICS[0]
 _NOTHING = 0.005  # a change of the error by a smaller share is none
+FEWEST_FOR_INTERVAL = 5  # runs: of fewer each is shown, as an interval would say more about Student's t than about them
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +100,12 @@ class Entry:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % confidence interval of the mean (Student's t); None for fewer than two runs."""
+        """95 % confidence interval of the mean (Student's t) within the figure's range; None for fewer than five runs."""
         mean, spread, n = self.mean, self.spread, len(self.values)
-        if mean is None or spread is None:
+        if mean is None or spread is None or n < FEWEST_FOR_INTERVAL:
             return None
         half = _half_width(spread, n)
-        return mean - half, mean + half
+        return max(mean - half, 0.0), min(mean + half, self.metric.most)
 
     @property
     def text(self) -> str:
@@ -301,7 +303,6 @@ def _csv(head: Sequence[str], content: Iterable[Mapping[str, object]]) -> str:
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#555555")  # Okabe and Ito
 _COLUMNS = 3
 _SINGLE_WIDTH = 3.5  # inches: one column of a page
-FEWEST_FOR_BAND = 5  # runs: of fewer each is drawn, as an interval would say more about Student's t than about them
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,11 +380,11 @@ def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
 def _draw_curve(axes: Axes, name: str, points: Sequence[Entry], color: str) -> None:
     means = np.array([(p.severity, p.mean) for p in points], dtype=float).T
     axes.plot(*means, "o-", color=color, lw=1.3, ms=3.5, label=plain_label(name))
-    banded = [(p.severity, *p.interval) for p in points if p.interval and len(p.values) >= FEWEST_FOR_BAND]
+    banded = [(p.severity, *p.interval) for p in points if p.interval]
     if banded:
         severity, low, high = np.array(banded).T
-        axes.fill_between(severity, np.maximum(low, 0.0), high, color=color, alpha=0.15, lw=0)
-    single = [(p.severity, v) for p in points if 1 < len(p.values) < FEWEST_FOR_BAND for v in p.values]
+        axes.fill_between(severity, low, high, color=color, alpha=0.15, lw=0)
+    single = [(p.severity, v) for p in points if 1 < len(p.values) < FEWEST_FOR_INTERVAL for v in p.values]
     if single:
         axes.plot(*np.array(single).T, ".", color=color, ms=3, alpha=0.6)
 
@@ -422,8 +423,8 @@ def _grid(count: int, height: float, below: float = 0.0) -> tuple[Figure, list[A
 # --- The report -------------------------------------------------------------------------------------------------------
 
 _SEVERITY = (
-    f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, of {FEWEST_FOR_BAND} runs or more; "
-    "of fewer every run is a dot."
+    f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, "
+    f"of {FEWEST_FOR_INTERVAL} runs or more; of fewer every run is a dot."
 )
 
 

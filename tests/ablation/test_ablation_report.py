@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import io
 import json
 import re
 import typing
@@ -18,6 +19,7 @@ from fgloc.ablation.failures import AnyFailure
 from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
 from fgloc.ablation.report import (
     ATE,
+    METRICS,
     Curves,
     Entry,
     Tracks,
@@ -25,6 +27,7 @@ from fgloc.ablation.report import (
     _measurable,
     join,
     matrix,
+    matrix_csv,
     plot_severity,
     plot_tracks,
     rows,
@@ -106,10 +109,28 @@ def test_matrix_holds_mean_spread_and_counts(bag):
     mild, harsh = entries["blind", 1.0, "full"], entries["blind", 2.0, "full"]
     assert mild.mean == pytest.approx(30.0)
     assert mild.spread == pytest.approx(10.0)
-    assert mild.interval == pytest.approx((30.0 - 4.3027 * 10 / 3**0.5, 30.0 + 4.3027 * 10 / 3**0.5), rel=1e-4)
     assert (len(harsh.values), harsh.runs, harsh.text) == (2, 3, "150 ± 71 (2 of 3)")
     assert entries["none", None, "full"].text == "10 (1)"
     assert entries["blind", 2.0, "bare"].values == (500.0,) * 3
+
+
+def test_intervals_are_of_five_runs_and_stay_in_range(bag):
+    jobs, records = made(bag)
+    assert "" not in [row["spread"] for row in table_of(jobs, records, "blind", "full")]
+    assert {row["low_95"] + row["high_95"] for row in table_of(jobs, records, "blind", "full")} == {""}
+    five = Entry("x", None, "full", ATE, (20.0, 25.0, 30.0, 35.0, 40.0), 5)
+    assert five.interval == pytest.approx(
+        (30.0 - 2.7764 * 62.5**0.5 / 5**0.5, 30.0 + 2.7764 * 62.5**0.5 / 5**0.5), 1e-4
+    )
+    assert replace(five, values=(0.0, 0.0, 0.0, 0.0, 100.0)).interval[0] == 0.0
+    within = next(metric for metric in METRICS if metric.key == "coverage.3")
+    assert replace(five, metric=within, values=(90.0, 100.0, 100.0, 100.0, 100.0)).interval[1] == 100.0
+
+
+def table_of(jobs, records, failure, variant):
+    """Rows of matrix.csv with the error of one failure and variant."""
+    table = csv.DictReader(io.StringIO(matrix_csv(matrix(SUITE, join(jobs, records)))))
+    return [r for r in table if (r["failure"], r["variant"], r["figure"]) == (failure, variant, ATE.label)]
 
 
 def figures(text):
