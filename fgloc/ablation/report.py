@@ -100,7 +100,7 @@ class Entry:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % confidence interval of the mean (Student's t) within the figure's range; None for fewer than five runs."""
+        """95 % confidence interval of the mean (Student's t) in the figure's range; None for fewer than five runs."""
         mean, spread, n = self.mean, self.spread, len(self.values)
         if mean is None or spread is None or n < FEWEST_FOR_INTERVAL:
             return None
@@ -199,7 +199,10 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
 
 
 def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
-    """Sentence: change of the mean error from the first to the second of each pair, if it is measurable."""
+    """Sentence: change of the mean error from the first to the second of each pair, if it is measurable.
+
+    Of fewer than five pairs it has the figures and claims neither a rise nor a fall.
+    """
     before, after = np.mean(pairs, axis=0)
     runs = f"over {len(pairs)} run{'s' if len(pairs) > 1 else ''}"
     if len(pairs) > 1:
@@ -210,6 +213,11 @@ def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
             return f"no measurable change of the mean error of '{variant}', {before:.3g} mm, {runs}"
     if abs(after - before) < _NOTHING * before:
         return f"the mean error of '{variant}' stays at {after:.3g} mm {runs}"
+    if len(pairs) < FEWEST_FOR_INTERVAL:
+        return (
+            f"the mean error of '{variant}' is {after:.3g} mm, without failure {before:.3g} mm, {runs}; "
+            f"fewer than {FEWEST_FOR_INTERVAL} show neither a rise nor a fall"
+        )
     way = "rises" if after > before else "falls"
     return f"the mean error of '{variant}' {way} from {before:.3g} to {after:.3g} mm {runs}"
 

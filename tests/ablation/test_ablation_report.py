@@ -143,7 +143,7 @@ def test_sentences_say_the_cost_and_its_limits(bag):
     blind = sentence(SUITE, runs, "blind")
     assert blind.startswith("Blind at 2 s: ")
     assert "'full'" in blind
-    assert figures(blind)[:4] == ["2", "10", "150", "2"]  # s, from and to mm, runs
+    assert figures(blind)[:4] == ["2", "150", "10", "2"]  # s, mm with and without it, runs
     assert "1 of 3 runs" in blind
     dark = sentence(SUITE, runs, "dark")
     assert (dark.split()[0], figures(dark)) == ("Dark", [])
@@ -165,14 +165,21 @@ def changed(runs, errors):
     ("errors", "said"),
     [
         ((0.0100, 0.0105, 0.0102), ["10", "3", "+0.23", "0.25"]),  # mm, runs, change and its spread
-        ((0.0103, 0.0105, 0.0107), ["10", "10.5", "3", "+0.50", "0.20"]),  # from and to
-        ((0.0080, 0.0085, 0.0080), ["10", "8.17", "3", "-1.83", "0.29"]),
+        ((0.0103, 0.0105, 0.0107), ["10.5", "10", "3", "+0.50", "0.20", "5"]),  # mm with and without it
+        ((0.0080, 0.0085, 0.0080), ["8.17", "10", "3", "-1.83", "0.29", "5"]),
     ],
 )
 def test_a_change_within_its_spread_is_no_change(bag, errors, said):
     told = sentence(SUITE, changed(join(*made(bag)), {2.0: errors}), "blind")
     assert told.startswith("Blind at 2 s: ")
     assert figures(told) == ["2", *said]
+
+
+def test_a_rise_or_fall_is_claimed_of_five_runs_or_more(bag):
+    runs = changed(join(*made(bag)), {2.0: (0.0080, 0.0085, 0.0080)})
+    assert "falls" not in sentence(SUITE, runs, "blind")
+    more = [run for run in runs if (run.cell.severity, run.cell.variant) == (2.0, "full")]
+    assert "falls from 10 to 8.17 mm" in sentence(SUITE, [*runs, *more], "blind")
 
 
 def test_of_many_runs_a_change_smaller_than_its_spread_is_one():
