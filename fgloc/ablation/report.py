@@ -7,7 +7,7 @@ import io
 import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -432,7 +432,8 @@ def _grid(count: int, height: float, below: float = 0.0) -> tuple[Figure, list[A
 
 _SEVERITY = (
     f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, "
-    f"of {FEWEST_FOR_INTERVAL} runs or more; of fewer every run is a dot."
+    f"of {FEWEST_FOR_INTERVAL} runs or more; of fewer every run is a dot. "
+    "Severity 0 is the run without failure."
 )
 
 
@@ -581,14 +582,20 @@ def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> list[tuple[str,
 
 
 def _curves(suite: Suite, entries: Sequence[Entry]) -> list[Curves]:
+    """Error over each severity that is varied; without failure it is 0, where the failure then does nothing."""
     plots = []
     for failure in suite.failures:
         if failure.severity is None or len(failure.severity.values) < 2:
             continue
         points: dict[str, list[Entry]] = {}
+        with_none = failure.nothing_at_zero and 0.0 not in failure.severity.values
         for e in entries:
-            if (e.failure, e.metric) == (failure.name, ATE) and e.values:
+            if e.metric != ATE or not e.values:
+                continue
+            if e.failure == failure.name:
                 points.setdefault(e.variant, []).append(e)
+            elif e.failure == NOTHING and with_none:
+                points.setdefault(e.variant, []).append(replace(e, severity=0.0))
         if points:
             plots.append(Curves(failure.name, failure.severity.axis, points))
     return plots

@@ -36,7 +36,7 @@ from fgloc.ablation.report import (
     worth,
     write_report,
 )
-from fgloc.ablation.suite import Cell, Suite, expand, load_suite
+from fgloc.ablation.suite import Cell, FailureEntry, Suite, expand, load_suite
 from fgloc.config import Config
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
@@ -212,12 +212,32 @@ def test_few_runs_are_drawn_one_by_one_and_axes_speak(bag):
     assert curves.unit == "duration [s]"
     axes = plot_severity([curves], ATE.label).axes[0]
     assert not axes.collections  # of three runs no band
+    means = [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "o"]
+    assert means == [[[0, 10], [1, 30], [2, 150]], [[0, 500], [1, 500], [2, 500]]]
     assert sum(len(line.get_xdata()) for line in axes.lines if line.get_marker() == ".") == 3 + 2 + 3 + 3
     many = Entry("x", 1.0, "full", ATE, (2.0, 2.5, 3.0, 3.5, 4.0), 5)
     axes = plot_severity([Curves("x", "y", {"full": [many, many]})], ATE.label).axes[0]
     assert len(axes.collections) == 1
     figure = plot_tracks([Tracks("x", [(0, 0), (1, 1)], [(0, 0), (1, 0)])])
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["estimate", "truth", "start"]
+
+
+@pytest.mark.parametrize(
+    ("chain", "field", "nothing"),
+    [
+        ([{"kind": "dropout", "sensor": "camera"}], "when.share", True),
+        ([{"kind": "sighting_noise"}], "range_m", True),
+        ([{"kind": "sighting_noise", "corner_px": 1.0}], "range_m", False),  # noise of corners is left
+        ([{"kind": "moved_marker"}], "yaw_rad", False),  # they are 0.3 m away
+        ([{"kind": "truncated"}], "keep", False),
+        ([{"kind": "latency", "sensor": "camera"}, {"kind": "darkness"}], "delay_s", False),
+    ],
+)
+def test_severity_0_is_the_run_without_failure_where_it_does_nothing(bag, chain, field, nothing):
+    blind = {"name": "blind", "chain": chain, "severity": {"field": field, "values": [1, 0.5]}}
+    suite = SUITE.model_copy(update={"failures": (FailureEntry.model_validate(blind),)})
+    (curves,) = _curves(suite, matrix(SUITE, join(*made(bag))))
+    assert [p.severity for p in curves.curves["full"]] == [0.0, 1.0, 2.0][not nothing :]
 
 
 def test_worst_case_is_the_largest_error(bag):
