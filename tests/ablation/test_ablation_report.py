@@ -28,9 +28,11 @@ from fgloc.ablation.report import (
     join,
     matrix,
     matrix_csv,
+    plot_failures,
     plot_severity,
     plot_tracks,
     rows,
+    runs_csv,
     sentence,
     worst,
     worth,
@@ -96,12 +98,13 @@ def made(bag):
                     affected = {"dropout": 5} if failure == "blind" else {}
                     track = {"estimate": [(0, 0), (1, error or 0)], "truth": [(0, 0), (1, 0)]}
                     figures = {"ate_mean_m": error if variant == "full" else 0.5, "coverage": {"3": 0.99}}
-                    record = Record(key=key, outcome="done", figures=figures, affected=affected, track=track, cost=COST)
+                    record = Record(key=key, outcome="done", figures=figures, affected=affected, track=track, **ALWAYS)
                 records[key] = record
     return jobs, records
 
 
 COST = Cost(seconds=1.0, cpu_s=1.0, peak_mb=100.0)
+ALWAYS = {"cost": COST, "sensors": ("wheels", "command")}
 
 
 def test_matrix_holds_mean_spread_and_counts(bag):
@@ -127,6 +130,34 @@ def test_intervals_are_of_five_runs_and_stay_in_range(bag):
     assert replace(five, metric=within, values=(90.0, 100.0, 100.0, 100.0, 100.0)).interval[1] == 100.0
 
 
+def test_a_failure_that_changed_no_message_has_no_figure(bag):
+    jobs, records = made(bag)
+    for row in table_of(jobs, records, "dark", "full"):
+        assert (row["mean"], row["spread"], row["n"], row["runs_changed"]) == ("", "", "3", "0")
+    assert [row["runs_changed"] for row in table_of(jobs, records, "blind", "full")] == ["3", "2"]
+    assert [(row["mean"], row["runs_changed"]) for row in table_of(jobs, records, "none", "full")] == [("10.0", "")]
+    runs = join(jobs, records)
+    changed = {(row["failure"], row["messages_changed"]) for row in csv.DictReader(io.StringIO(runs_csv(runs)))}
+    assert changed == {("none", ""), ("blind", "5"), ("blind", ""), ("dark", "0")}  # "": a run without a result
+    assert worst(SUITE, runs, "dark") is None
+    dark = [run for run in runs if run.cell.failure == "dark"]
+    assert worth(SUITE, dark, "bare") is None
+
+
+def test_points_of_a_failure_that_changed_no_message_are_hollow(bag):
+    jobs, records = made(bag)
+    still = {key: record.model_copy(update={"affected": {}}) for key, record in records.items()}
+    entries, none_hit = matrix(SUITE, join(jobs, records)), matrix(SUITE, join(jobs, still))
+
+    def hollow(figure):
+        return sum(len(line.get_xdata()) for line in figure.axes[0].lines if line.get_markerfacecolor() == "white")
+
+    assert hollow(plot_failures(SUITE, entries)) == 2  # dark, of both variants
+    assert hollow(plot_failures(SUITE, none_hit)) == 6
+    assert hollow(plot_severity(_curves(SUITE, entries), ATE.label)) == 0
+    assert hollow(plot_severity(_curves(SUITE, none_hit), ATE.label)) == 4  # none at 0 is a result
+
+
 def table_of(jobs, records, failure, variant):
     """Rows of matrix.csv with the error of one failure and variant."""
     table = csv.DictReader(io.StringIO(matrix_csv(matrix(SUITE, join(jobs, records)))))
@@ -147,6 +178,7 @@ def test_sentences_say_the_cost_and_its_limits(bag):
     assert "1 of 3 runs" in blind
     dark = sentence(SUITE, runs, "dark")
     assert (dark.split()[0], figures(dark)) == ("Dark", [])
+    assert dark.endswith(": wheels, command.")  # what could be failed instead
 
 
 def changed(runs, errors):
