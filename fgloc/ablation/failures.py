@@ -43,6 +43,7 @@ class Dropout(EventFailure):
 class ClockOffset(EventFailure):
     """A sensor's clock is ahead by ``offset_s`` and gains ``drift_ppm``: its stamps are wrong, its arrival is not."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("offset_s", "drift_ppm")
     kind: Literal["clock_offset"] = "clock_offset"
     sensor: SensorName
     offset_s: float = Field(0.1, description="s; negative: behind")
@@ -70,6 +71,7 @@ class Latency(Failure):
     commands that the recorder received late, not commands that the robot followed late.
     """
 
+    sizes: ClassVar[tuple[str, ...]] = ("delay_s", "jitter_s")
     kind: Literal["latency"] = "latency"
     sensor: SensorName
     delay_s: float = Field(0.0, ge=0, description="s")
@@ -165,6 +167,7 @@ class SightingFailure(EventFailure):
 class SightingNoise(SightingFailure):
     """White noise, of the standard deviations below, on each number that a sighting reports."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("corner_px", "range_m", "bearing_rad", "position_m")
     kind: Literal["sighting_noise"] = "sighting_noise"
     corner_px: float = Field(0.0, ge=0, description="px, on each coordinate of each corner")
     range_m: float = Field(0.0, ge=0, description="m")
@@ -180,6 +183,7 @@ class SightingNoise(SightingFailure):
 class OccludedIds(SightingFailure):
     """Markers are hidden: those of ``ids``, and a random ``part`` of the map's others, the same throughout a run."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("ids", "part")
     kind: Literal["occluded_ids"] = "occluded_ids"
     ids: tuple[int, ...] = ()
     part: float = Field(0.0, ge=0, le=1, description="share of the map's markers; the number is rounded")
@@ -195,6 +199,7 @@ class OccludedIds(SightingFailure):
 class WrongIds(SightingFailure):
     """A sighting is read as another marker of the map with probability ``probability``."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("probability",)
     kind: Literal["wrong_ids"] = "wrong_ids"
     probability: float = Field(0.05, ge=0, le=1, description="of each sighting")
 
@@ -237,6 +242,7 @@ class MovedMarker(Failure):
     """
 
     timed: ClassVar[bool] = False
+    sizes: ClassVar[tuple[str, ...]] = ("distance_m", "yaw_rad")
     kind: Literal["moved_marker"] = "moved_marker"
     ids: tuple[int, ...] = ()
     count: int = Field(1, ge=1, description="markers to be moved if no ids are given")

@@ -28,13 +28,14 @@ from fgloc.errors import FglocError, OutputError, RecordingError
 from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
 from fgloc.evaluation.report import write_results
 from fgloc.files.outputs import sha256_of, write_json, write_text
-from fgloc.recording.reader import open_recording
+from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
 from fgloc.sensors.markers.images import ImageError, ImageEvent
+from fgloc.sensors.registry import events_by_sensor, streams_of
 from fgloc.types import Mode, TruthEvent
 
 # --- Records, written whole or not at all, and a line for every attempt -----------------------------------------------
@@ -70,6 +71,7 @@ class Record(BaseModel):
     figures: dict[str, Any] = {}  # of Metrics, without times
     modes: dict[str, float] = {}  # mode -> share of the poses
     mistakes: tuple[str, ...] = ()  # of the set-up
+    sensors: tuple[str, ...] = ()  # with messages in the recording, as failures name them
     affected: dict[str, int] = {}  # events that the failures changed, by kind
     track: Track | None = None
     cost: Cost
@@ -299,6 +301,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     config = resolved(cell.config, cell.map)
     with open_recording(cell.bag, config.recording) as recording:
         start_ns, duration_s = recording.span_ns[0], recording.duration_s
+        sensors = _sensors(recording)
     landmark_map = configured_map(cell.map, config) if cell.map is not None else None
     ids = () if landmark_map is None else tuple(sorted(landmark_map.landmarks))
     scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(cell.chain), cell.seed)]
@@ -340,9 +343,17 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
         "figures": _figures(metrics),
         "modes": {mode.value: sum(m is mode for m in result.modes) / len(result.modes) for mode in Mode},
         "mistakes": result.mistakes,
+        "sensors": sensors,
         "affected": affected,
         "track": _track(result, config),
     }
+
+
+def _sensors(recording: Recording) -> tuple[str, ...]:
+    """Sensors with messages in a recording, as failures name them."""
+    roles = [topic.role for topic in recording.topics if topic.role is not None and topic.count]
+    heard = {stream.event for role in roles for stream in streams_of(role)}
+    return tuple(name for name, events in events_by_sensor().items() if heard.intersection(events))
 
 
 def _figures(metrics: Metrics) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import io
 import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ class Metric:
     label: str
     factor: float = 1.0  # from the SI value to what is shown
     form: str = ".3g"
+    most: float = math.inf  # largest possible value in shown units; the smallest is 0
 
     def of(self, record: Record) -> float | None:
         """The record's value in shown units; None if it has none."""
@@ -54,10 +55,11 @@ METRICS = (
     Metric("yaw_mae_deg", "yaw MAE [°]", 1.0, ".3g"),
     Metric("drift_percent", "drift [%]", 1.0, ".3g"),
     Metric("nees_over_3", "NEES / 3", 1.0, ".2f"),
-    Metric("coverage.3", "within 3σ [%]", 100.0, ".1f"),
+    Metric("coverage.3", "within 3σ [%]", 100.0, ".1f", 100.0),
 )
 ATE = METRICS[0]
 _NOTHING = 0.005  # a change of the error by a smaller share is none
+FEWEST_FOR_INTERVAL = 5  # runs: of fewer each is shown, as an interval would say more about Student's t than about them
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +87,12 @@ class Entry:
     metric: Metric
     values: tuple[float, ...]
     runs: int  # that were asked for; fewer values: the others gave none
+    changed: int | None = None  # runs in which the failure changed a message; None: there is no failure
+
+    @property
+    def unchanged(self) -> bool:
+        """Whether its values say nothing of the failure, which changed no message."""
+        return self.changed == 0 and bool(self.values)
 
     @property
     def mean(self) -> float | None:
@@ -98,37 +106,41 @@ class Entry:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % confidence interval of the mean (Student's t); None for fewer than two runs."""
+        """95 % confidence interval of the mean (Student's t) in the figure's range; None for fewer than five runs."""
         mean, spread, n = self.mean, self.spread, len(self.values)
-        if mean is None or spread is None:
+        if mean is None or spread is None or n < FEWEST_FOR_INTERVAL:
             return None
         half = _half_width(spread, n)
-        return mean - half, mean + half
+        return max(mean - half, 0.0), min(mean + half, self.metric.most)
 
     @property
     def text(self) -> str:
-        """``mean ± spread (n)``, or how many of the runs failed."""
+        """``mean ± spread (n)``, or how many of the runs failed, or that the failure changed no message."""
         if self.mean is None:
             return f"no result (0 of {self.runs})"
         shown = f"{self.mean:{self.metric.form}}"
-        if self.spread is not None:
+        if self.unchanged:
+            shown = "no message changed"
+        elif self.spread is not None:
             shown = " ± ".join(rounded(self.mean, self.spread))
         count = f"{len(self.values)}" if len(self.values) == self.runs else f"{len(self.values)} of {self.runs}"
         return f"{shown} ({count})"
 
     @property
     def row(self) -> dict[str, Any]:
-        """The figure, as tables have it."""
+        """The figure, as tables have it: empty where the failure changed no message, as that is no cost of 0."""
+        mean, spread, interval = (None,) * 3 if self.unchanged else (self.mean, self.spread, self.interval)
         return {
             "failure": self.failure,
             "severity": self.severity,
             "variant": self.variant,
             "figure": self.metric.label,
-            "mean": self.mean,
-            "spread": self.spread,
-            "interval_95": self.interval,
+            "mean": mean,
+            "spread": spread,
+            "interval_95": interval,
             "n": len(self.values),
             "runs": self.runs,
+            "runs_changed": self.changed,
         }
 
 
@@ -154,9 +166,10 @@ def matrix(suite: Suite, runs: Sequence[Run]) -> list[Entry]:
     for failure, severity in rows(suite):
         for variant in suite.variants:
             here = select(runs, failure, severity, variant.name)
+            changed = None if failure == NOTHING else sum(bool(run.record.affected) for run in here)
             for metric in METRICS:
                 values = tuple(v for run in here if (v := metric.of(run.record)) is not None)
-                entries.append(Entry(failure, severity, variant.name, metric, values, len(here)))
+                entries.append(Entry(failure, severity, variant.name, metric, values, len(here), changed))
     return entries
 
 
@@ -183,7 +196,9 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
     if not any(run.record.affected for run in here if run.record.outcome == "done") and all(
         run.record.outcome == "done" for run in here
     ):
-        return f"{name}{at} changed no message of these recordings: they show nothing about it."
+        heard = dict.fromkeys(sensor for run in here for sensor in run.record.sensors)
+        others = f" Sensors with messages there: {', '.join(heard)}." if heard else ""
+        return f"{name}{at} changed no message of these recordings: they show nothing about it.{others}"
     without = {run.cell.recording: ATE.of(run.record) for run in select(runs, NOTHING, None, variant)}
     pairs = [
         (before, after)
@@ -197,7 +212,10 @@ def sentence(suite: Suite, runs: Sequence[Run], failure: str) -> str:
 
 
 def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
-    """Sentence: change of the mean error from the first to the second of each pair, if it is measurable."""
+    """Sentence: change of the mean error from the first to the second of each pair, if it is measurable.
+
+    Of fewer than five pairs it has the figures and claims neither a rise nor a fall.
+    """
     before, after = np.mean(pairs, axis=0)
     runs = f"over {len(pairs)} run{'s' if len(pairs) > 1 else ''}"
     if len(pairs) > 1:
@@ -208,6 +226,11 @@ def _change(pairs: Sequence[tuple[float, float]], variant: str) -> str:
             return f"no measurable change of the mean error of '{variant}', {before:.3g} mm, {runs}"
     if abs(after - before) < _NOTHING * before:
         return f"the mean error of '{variant}' stays at {after:.3g} mm {runs}"
+    if len(pairs) < FEWEST_FOR_INTERVAL:
+        return (
+            f"the mean error of '{variant}' is {after:.3g} mm, without failure {before:.3g} mm, {runs}; "
+            f"fewer than {FEWEST_FOR_INTERVAL} show neither a rise nor a fall"
+        )
     way = "rises" if after > before else "falls"
     return f"the mean error of '{variant}' {way} from {before:.3g} to {after:.3g} mm {runs}"
 
@@ -230,6 +253,10 @@ def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
     first = suite.variants[0].name
     found = []
     for failure, severity in rows(suite):
+        if failure != NOTHING and not any(
+            run.record.affected for name in (first, variant) for run in select(runs, failure, severity, name)
+        ):
+            continue
         theirs = {(r.cell.recording, r.cell.seed): ATE.of(r.record) for r in select(runs, failure, severity, variant)}
         pairs = [
             (ours, other)
@@ -262,13 +289,14 @@ def worth(suite: Suite, runs: Sequence[Run], variant: str) -> str | None:
 
 
 def worst(suite: Suite, runs: Sequence[Run], failure: str) -> Run | None:
-    """The run of the first variant with the largest error; None if none has a track."""
+    """The run of the first variant with the largest error; None if none with a track had a message changed."""
     variant = suite.variants[0].name
     found = [
         (ate, k)
         for k, run in enumerate(runs)
         if (run.cell.failure, run.cell.variant) == (failure, variant)
         and run.record.track is not None
+        and (failure == NOTHING or run.record.affected)
         and (ate := ATE.of(run.record)) is not None
     ]
     return runs[max(found)[1]] if found else None
@@ -276,16 +304,28 @@ def worst(suite: Suite, runs: Sequence[Run], failure: str) -> Run | None:
 
 def matrix_csv(entries: Iterable[Entry]) -> str:
     """The matrix, one figure a row, in the units that the labels name."""
-    head = ("failure", "severity", "variant", "figure", "mean", "spread", "low_95", "high_95", "n", "runs")
     ends = ("low_95", "high_95")
-    return _csv(head, (e.row | dict(zip(ends, e.interval or (None, None), strict=True)) for e in entries))
+    head = ("failure", "severity", "variant", "figure", "mean", "spread", *ends, "n", "runs", "runs_changed")
+    content = (e.row for e in entries)
+    return _csv(head, (row | dict(zip(ends, row["interval_95"] or (None, None), strict=True)) for row in content))
 
 
 def runs_csv(runs: Sequence[Run]) -> str:
     """Every run with its figures, in the units that the labels name."""
-    head = ("recording", "failure", "severity", "variant", "seed", "outcome", *(m.label for m in METRICS), "key")
-    figures = ({m.label: m.of(run.record) for m in METRICS} for run in runs)
-    return _csv(head, (run.row | {"outcome": run.record.outcome} | own for run, own in zip(runs, figures, strict=True)))
+    place = ("recording", "failure", "severity", "variant", "seed", "outcome", "messages_changed")
+    content = (
+        run.row
+        | {"outcome": run.record.outcome, "messages_changed": _messages_changed(run)}
+        | {m.label: m.of(run.record) for m in METRICS}
+        for run in runs
+    )
+    return _csv((*place, *(m.label for m in METRICS), "key"), content)
+
+
+def _messages_changed(run: Run) -> int | None:
+    """Messages that a failure changed; None: there is no failure, or no result."""
+    known = run.cell.failure != NOTHING and run.record.outcome == "done"
+    return sum(run.record.affected.values()) if known else None
 
 
 def _csv(head: Sequence[str], content: Iterable[Mapping[str, object]]) -> str:
@@ -301,7 +341,6 @@ def _csv(head: Sequence[str], content: Iterable[Mapping[str, object]]) -> str:
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#555555")  # Okabe and Ito
 _COLUMNS = 3
 _SINGLE_WIDTH = 3.5  # inches: one column of a page
-FEWEST_FOR_BAND = 5  # runs: of fewer each is drawn, as an interval would say more about Student's t than about them
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,7 +365,8 @@ def plot_failures(suite: Suite, entries: Sequence[Entry]) -> Figure:
     """Error of each failure, one below the other, by variant: mean, and every run as a dot; logarithmic."""
     shown = [(name, severity, f"{name} {_with_unit(suite, name, severity)}".rstrip()) for name, severity in rows(suite)]
     names = [variant.name for variant in suite.variants]
-    height = (0.09 + 0.09 * len(names)) * len(shown) + 0.6 + 0.18 * math.ceil(len(names) / 3)
+    marked = any(e.unchanged for e in entries)
+    height = (0.09 + 0.09 * len(names)) * len(shown) + 0.6 + 0.18 * math.ceil((len(names) + marked) / 3)
     figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
     ax = figure.add_subplot()
     tidy(ax)
@@ -334,16 +374,12 @@ def plot_failures(suite: Suite, entries: Sequence[Entry]) -> Figure:
         color, offset = _COLORS[i % len(_COLORS)], (i - 0.5 * (len(names) - 1)) * 0.6 / len(names)
         found = {(e.failure, e.severity): e for e in entries if e.variant == name and e.metric == ATE and e.values}
         at = [(row + offset, found[key[:2]]) for row, key in enumerate(shown) if key[:2] in found]
-        single = [(value, y) for y, e in at for value in e.values]
+        single = [(value, y) for y, e in at for value in e.values if not e.unchanged]
         ax.plot(*np.array(single).reshape(-1, 2).T, ".", color=color, ms=3, alpha=0.5)
-        ax.plot(
-            [float(np.mean(e.values)) for _, e in at],
-            [y for y, _ in at],
-            "o",
-            color=color,
-            ms=4.5,
-            label=plain_label(name),
-        )
+        for hollow in (False, True):
+            means = np.array([(np.mean(e.values), y) for y, e in at if e.unchanged == hollow]).reshape(-1, 2).T
+            look: dict[str, Any] = {"mfc": "white"} if hollow else {"label": plain_label(name)}
+            ax.plot(*means, "o", color=color, ms=4.5, **look)
     ax.set_yticks(range(len(shown)), [plain_label(label) for *_, label in shown], fontsize=SMALL)
     ax.invert_yaxis()
     ax.set_xscale("log")
@@ -351,8 +387,17 @@ def plot_failures(suite: Suite, entries: Sequence[Entry]) -> Figure:
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel(ATE.label, fontsize=SMALL)
-    figure.legend(loc="outside lower center", ncols=3, fontsize=SMALL, frameon=False)
+    handles = ax.get_legend_handles_labels()[0]
+    if marked:
+        handles.append(_hollow())
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=SMALL, frameon=False)
     return figure
+
+
+def _hollow() -> Line2D:
+    """Legend of the points of failures that changed no message."""
+    look: dict[str, Any] = dict(marker="o", ms=4.5, mfc="white", linestyle="none")
+    return Line2D([], [], color="#555555", label="no message changed", **look)
 
 
 def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
@@ -361,8 +406,9 @@ def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
     Bands are the intervals of five runs or more; of fewer runs every one is a dot.
     """
     names = list(dict.fromkeys(name for plot in plots for name in plot.curves))
+    marked = any(point.unchanged for plot in plots for points in plot.curves.values() for point in points)
     columns = 1 if len(plots) == 1 else 2 if len(plots) == 2 else 4  # of the legend: what the plots' width has room for
-    figure, axes = _grid(len(plots), 1.9, below=0.18 * math.ceil(len(names) / columns))
+    figure, axes = _grid(len(plots), 1.9, below=0.18 * math.ceil((len(names) + marked) / columns))
     for ax, plot in zip(axes, plots, strict=True):
         for name, points in plot.curves.items():
             _draw_curve(ax, name, points, _COLORS[names.index(name) % len(_COLORS)])
@@ -371,6 +417,8 @@ def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
         ax.set_ylim(bottom=0.0)
     axes[0].set_ylabel(label, fontsize=SMALL)
     handles = {name: h for ax in axes for h, name in zip(*ax.get_legend_handles_labels(), strict=True)}
+    if marked:
+        handles["no message changed"] = _hollow()
     look: dict[str, Any] = dict(ncols=columns, fontsize=SMALL, frameon=False)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", **look)
     return figure
@@ -379,11 +427,15 @@ def plot_severity(plots: Sequence[Curves], label: str) -> Figure:
 def _draw_curve(axes: Axes, name: str, points: Sequence[Entry], color: str) -> None:
     means = np.array([(p.severity, p.mean) for p in points], dtype=float).T
     axes.plot(*means, "o-", color=color, lw=1.3, ms=3.5, label=plain_label(name))
-    banded = [(p.severity, *p.interval) for p in points if p.interval and len(p.values) >= FEWEST_FOR_BAND]
+    hollow = [(p.severity, p.mean) for p in points if p.unchanged]
+    if hollow:
+        axes.plot(*np.array(hollow).T, "o", color=color, ms=3.5, mfc="white")
+    banded = [(p.severity, *p.interval) for p in points if p.interval and not p.unchanged]
     if banded:
         severity, low, high = np.array(banded).T
-        axes.fill_between(severity, np.maximum(low, 0.0), high, color=color, alpha=0.15, lw=0)
-    single = [(p.severity, v) for p in points if 1 < len(p.values) < FEWEST_FOR_BAND for v in p.values]
+        axes.fill_between(severity, low, high, color=color, alpha=0.15, lw=0)
+    few = (p for p in points if 1 < len(p.values) < FEWEST_FOR_INTERVAL and not p.unchanged)
+    single = [(p.severity, v) for p in few for v in p.values]
     if single:
         axes.plot(*np.array(single).T, ".", color=color, ms=3, alpha=0.6)
 
@@ -422,8 +474,9 @@ def _grid(count: int, height: float, below: float = 0.0) -> tuple[Figure, list[A
 # --- The report -------------------------------------------------------------------------------------------------------
 
 _SEVERITY = (
-    f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, of {FEWEST_FOR_BAND} runs or more; "
-    "of fewer every run is a dot."
+    f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, "
+    f"of {FEWEST_FOR_INTERVAL} runs or more; of fewer every run is a dot. "
+    "Severity 0 is the run without failure."
 )
 
 
@@ -572,14 +625,20 @@ def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> list[tuple[str,
 
 
 def _curves(suite: Suite, entries: Sequence[Entry]) -> list[Curves]:
+    """Error over each severity that is varied; without failure it is 0, where the failure then does nothing."""
     plots = []
     for failure in suite.failures:
         if failure.severity is None or len(failure.severity.values) < 2:
             continue
         points: dict[str, list[Entry]] = {}
+        with_none = failure.nothing_at_zero and 0.0 not in failure.severity.values
         for e in entries:
-            if (e.failure, e.metric) == (failure.name, ATE) and e.values:
+            if e.metric != ATE or not e.values:
+                continue
+            if e.failure == failure.name:
                 points.setdefault(e.variant, []).append(e)
+            elif e.failure == NOTHING and with_none:
+                points.setdefault(e.variant, []).append(replace(e, severity=0.0))
         if points:
             plots.append(Curves(failure.name, failure.severity.axis, points))
     return plots

@@ -7,6 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from fgloc.ablation.failures import AnyFailure
@@ -80,6 +81,17 @@ class FailureEntry(Section):
         for _ in self.severities():
             pass
         return self
+
+    @property
+    def nothing_at_zero(self) -> bool:
+        """Whether severity 0 is the run without failure; False if not known."""
+        first = self.chain[0]
+        if self.severity is None or len(self.chain) > 1:
+            return False
+        field = self.severity.field
+        if field in _WHEN:
+            return field == "when.share" or not first.when.intervals
+        return field in first.sizes and not any(np.any(getattr(first, name)) for name in {*first.sizes} - {field})
 
     def severities(self) -> Iterator[tuple[float | None, tuple[AnyFailure, ...]]]:
         """Each severity with its chain; a failure without any gives one, None."""

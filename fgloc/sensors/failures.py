@@ -121,6 +121,7 @@ class Failure(Section):
     stage: ClassVar[Literal["recorded", "sightings"]] = "recorded"
     timed: ClassVar[bool] = True  # False: lasts the whole run, `when` is refused
     pixels: ClassVar[bool] = False  # True: changes what an image shows
+    sizes: ClassVar[tuple[str, ...]] = ()  # numbers that, if all are 0, make it change nothing
     kind: str
     when: When = When()
 

@@ -152,6 +152,7 @@ class GnssPosition(PoseMeasurement):
 class Multipath(EventFailure):
     """Reflections move positions, each by a draw of its own: in any direction, exponentially far."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("mean_m",)
     kind: Literal["gnss_multipath"] = "gnss_multipath"
     mean_m: float = Field(3.0, gt=0, description="mean distance, exponentially distributed [m]")
 

@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -434,6 +434,7 @@ CHANNELS = (
 class ImuBias(EventFailure):
     """The gyroscope's yaw rate is off by ``yaw_rate`` and the accelerometer by ``acceleration``."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("yaw_rate", "acceleration")
     kind: Literal["imu_bias"] = "imu_bias"
     yaw_rate: float = Field(0.05, description="rad/s, about z")
     acceleration: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="m/s², in the sensor's axes")

@@ -176,6 +176,7 @@ class UwbRange(PoseMeasurement):
 class NonLineOfSight(EventFailure):
     """Ranges are too long, each by a draw of its own, exponentially distributed."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("mean_m",)
     kind: Literal["uwb_non_line_of_sight"] = "uwb_non_line_of_sight"
     mean_m: float = Field(1.0, gt=0, description="mean excess of a range [m]")
 

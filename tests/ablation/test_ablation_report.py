@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import io
 import json
 import re
 import typing
@@ -18,6 +19,7 @@ from fgloc.ablation.failures import AnyFailure
 from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
 from fgloc.ablation.report import (
     ATE,
+    METRICS,
     Curves,
     Entry,
     Tracks,
@@ -25,15 +27,18 @@ from fgloc.ablation.report import (
     _measurable,
     join,
     matrix,
+    matrix_csv,
+    plot_failures,
     plot_severity,
     plot_tracks,
     rows,
+    runs_csv,
     sentence,
     worst,
     worth,
     write_report,
 )
-from fgloc.ablation.suite import Cell, Suite, expand, load_suite
+from fgloc.ablation.suite import Cell, FailureEntry, Suite, expand, load_suite
 from fgloc.config import Config
 
 ROOT = Path(fgloc.__file__).resolve().parent.parent
@@ -93,12 +98,13 @@ def made(bag):
                     affected = {"dropout": 5} if failure == "blind" else {}
                     track = {"estimate": [(0, 0), (1, error or 0)], "truth": [(0, 0), (1, 0)]}
                     figures = {"ate_mean_m": error if variant == "full" else 0.5, "coverage": {"3": 0.99}}
-                    record = Record(key=key, outcome="done", figures=figures, affected=affected, track=track, cost=COST)
+                    record = Record(key=key, outcome="done", figures=figures, affected=affected, track=track, **ALWAYS)
                 records[key] = record
     return jobs, records
 
 
 COST = Cost(seconds=1.0, cpu_s=1.0, peak_mb=100.0)
+ALWAYS = {"cost": COST, "sensors": ("wheels", "command")}
 
 
 def test_matrix_holds_mean_spread_and_counts(bag):
@@ -106,10 +112,56 @@ def test_matrix_holds_mean_spread_and_counts(bag):
     mild, harsh = entries["blind", 1.0, "full"], entries["blind", 2.0, "full"]
     assert mild.mean == pytest.approx(30.0)
     assert mild.spread == pytest.approx(10.0)
-    assert mild.interval == pytest.approx((30.0 - 4.3027 * 10 / 3**0.5, 30.0 + 4.3027 * 10 / 3**0.5), rel=1e-4)
     assert (len(harsh.values), harsh.runs, harsh.text) == (2, 3, "150 ± 71 (2 of 3)")
     assert entries["none", None, "full"].text == "10 (1)"
     assert entries["blind", 2.0, "bare"].values == (500.0,) * 3
+
+
+def test_intervals_are_of_five_runs_and_stay_in_range(bag):
+    jobs, records = made(bag)
+    assert "" not in [row["spread"] for row in table_of(jobs, records, "blind", "full")]
+    assert {row["low_95"] + row["high_95"] for row in table_of(jobs, records, "blind", "full")} == {""}
+    five = Entry("x", None, "full", ATE, (20.0, 25.0, 30.0, 35.0, 40.0), 5)
+    assert five.interval == pytest.approx(
+        (30.0 - 2.7764 * 62.5**0.5 / 5**0.5, 30.0 + 2.7764 * 62.5**0.5 / 5**0.5), 1e-4
+    )
+    assert replace(five, values=(0.0, 0.0, 0.0, 0.0, 100.0)).interval[0] == 0.0
+    within = next(metric for metric in METRICS if metric.key == "coverage.3")
+    assert replace(five, metric=within, values=(90.0, 100.0, 100.0, 100.0, 100.0)).interval[1] == 100.0
+
+
+def test_a_failure_that_changed_no_message_has_no_figure(bag):
+    jobs, records = made(bag)
+    for row in table_of(jobs, records, "dark", "full"):
+        assert (row["mean"], row["spread"], row["n"], row["runs_changed"]) == ("", "", "3", "0")
+    assert [row["runs_changed"] for row in table_of(jobs, records, "blind", "full")] == ["3", "2"]
+    assert [(row["mean"], row["runs_changed"]) for row in table_of(jobs, records, "none", "full")] == [("10.0", "")]
+    runs = join(jobs, records)
+    changed = {(row["failure"], row["messages_changed"]) for row in csv.DictReader(io.StringIO(runs_csv(runs)))}
+    assert changed == {("none", ""), ("blind", "5"), ("blind", ""), ("dark", "0")}  # "": a run without a result
+    assert worst(SUITE, runs, "dark") is None
+    dark = [run for run in runs if run.cell.failure == "dark"]
+    assert worth(SUITE, dark, "bare") is None
+
+
+def test_points_of_a_failure_that_changed_no_message_are_hollow(bag):
+    jobs, records = made(bag)
+    still = {key: record.model_copy(update={"affected": {}}) for key, record in records.items()}
+    entries, none_hit = matrix(SUITE, join(jobs, records)), matrix(SUITE, join(jobs, still))
+
+    def hollow(figure):
+        return sum(len(line.get_xdata()) for line in figure.axes[0].lines if line.get_markerfacecolor() == "white")
+
+    assert hollow(plot_failures(SUITE, entries)) == 2  # dark, of both variants
+    assert hollow(plot_failures(SUITE, none_hit)) == 6
+    assert hollow(plot_severity(_curves(SUITE, entries), ATE.label)) == 0
+    assert hollow(plot_severity(_curves(SUITE, none_hit), ATE.label)) == 4  # none at 0 is a result
+
+
+def table_of(jobs, records, failure, variant):
+    """Rows of matrix.csv with the error of one failure and variant."""
+    table = csv.DictReader(io.StringIO(matrix_csv(matrix(SUITE, join(jobs, records)))))
+    return [r for r in table if (r["failure"], r["variant"], r["figure"]) == (failure, variant, ATE.label)]
 
 
 def figures(text):
@@ -122,10 +174,11 @@ def test_sentences_say_the_cost_and_its_limits(bag):
     blind = sentence(SUITE, runs, "blind")
     assert blind.startswith("Blind at 2 s: ")
     assert "'full'" in blind
-    assert figures(blind)[:4] == ["2", "10", "150", "2"]  # s, from and to mm, runs
+    assert figures(blind)[:4] == ["2", "150", "10", "2"]  # s, mm with and without it, runs
     assert "1 of 3 runs" in blind
     dark = sentence(SUITE, runs, "dark")
     assert (dark.split()[0], figures(dark)) == ("Dark", [])
+    assert dark.endswith(": wheels, command.")  # what could be failed instead
 
 
 def changed(runs, errors):
@@ -144,14 +197,21 @@ def changed(runs, errors):
     ("errors", "said"),
     [
         ((0.0100, 0.0105, 0.0102), ["10", "3", "+0.23", "0.25"]),  # mm, runs, change and its spread
-        ((0.0103, 0.0105, 0.0107), ["10", "10.5", "3", "+0.50", "0.20"]),  # from and to
-        ((0.0080, 0.0085, 0.0080), ["10", "8.17", "3", "-1.83", "0.29"]),
+        ((0.0103, 0.0105, 0.0107), ["10.5", "10", "3", "+0.50", "0.20", "5"]),  # mm with and without it
+        ((0.0080, 0.0085, 0.0080), ["8.17", "10", "3", "-1.83", "0.29", "5"]),
     ],
 )
 def test_a_change_within_its_spread_is_no_change(bag, errors, said):
     told = sentence(SUITE, changed(join(*made(bag)), {2.0: errors}), "blind")
     assert told.startswith("Blind at 2 s: ")
     assert figures(told) == ["2", *said]
+
+
+def test_a_rise_or_fall_is_claimed_of_five_runs_or_more(bag):
+    runs = changed(join(*made(bag)), {2.0: (0.0080, 0.0085, 0.0080)})
+    assert "falls" not in sentence(SUITE, runs, "blind")
+    more = [run for run in runs if (run.cell.severity, run.cell.variant) == (2.0, "full")]
+    assert "falls from 10 to 8.17 mm" in sentence(SUITE, [*runs, *more], "blind")
 
 
 def test_of_many_runs_a_change_smaller_than_its_spread_is_one():
@@ -184,12 +244,32 @@ def test_few_runs_are_drawn_one_by_one_and_axes_speak(bag):
     assert curves.unit == "duration [s]"
     axes = plot_severity([curves], ATE.label).axes[0]
     assert not axes.collections  # of three runs no band
+    means = [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "o"]
+    assert means == [[[0, 10], [1, 30], [2, 150]], [[0, 500], [1, 500], [2, 500]]]
     assert sum(len(line.get_xdata()) for line in axes.lines if line.get_marker() == ".") == 3 + 2 + 3 + 3
     many = Entry("x", 1.0, "full", ATE, (2.0, 2.5, 3.0, 3.5, 4.0), 5)
     axes = plot_severity([Curves("x", "y", {"full": [many, many]})], ATE.label).axes[0]
     assert len(axes.collections) == 1
     figure = plot_tracks([Tracks("x", [(0, 0), (1, 1)], [(0, 0), (1, 0)])])
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["estimate", "truth", "start"]
+
+
+@pytest.mark.parametrize(
+    ("chain", "field", "nothing"),
+    [
+        ([{"kind": "dropout", "sensor": "camera"}], "when.share", True),
+        ([{"kind": "sighting_noise"}], "range_m", True),
+        ([{"kind": "sighting_noise", "corner_px": 1.0}], "range_m", False),  # noise of corners is left
+        ([{"kind": "moved_marker"}], "yaw_rad", False),  # they are 0.3 m away
+        ([{"kind": "truncated"}], "keep", False),
+        ([{"kind": "latency", "sensor": "camera"}, {"kind": "darkness"}], "delay_s", False),
+    ],
+)
+def test_severity_0_is_the_run_without_failure_where_it_does_nothing(bag, chain, field, nothing):
+    blind = {"name": "blind", "chain": chain, "severity": {"field": field, "values": [1, 0.5]}}
+    suite = SUITE.model_copy(update={"failures": (FailureEntry.model_validate(blind),)})
+    (curves,) = _curves(suite, matrix(SUITE, join(*made(bag))))
+    assert [p.severity for p in curves.curves["full"]] == [0.0, 1.0, 2.0][not nothing :]
 
 
 def test_worst_case_is_the_largest_error(bag):

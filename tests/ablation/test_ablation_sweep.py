@@ -104,9 +104,11 @@ def test_sweep_answers_what_a_failure_costs(folder, swept):
     assert by_cell["full", "blind", 3.0].affected == {"dropout": 12}
     assert by_cell["full", "blind", 3.0].modes["DEAD_RECKONING"] > 0.0
     assert by_cell["full", "dead", None].figures["ate_mean_m"] > by_cell["full", "none", None].figures["ate_mean_m"]
+    assert by_cell["full", "dead", None].sensors == ("wheels", "camera")
     alone = by_cell["wheels alone", "none", None]
     assert alone.figures["factors"] == {"prior": 1, "wheels": alone.figures["keyframes"] - 1}
-    assert by_cell["wheels alone", "blind", 1.0].affected == {}  # it is blind anyway: the report says so
+    assert by_cell["wheels alone", "blind", 1.0].affected == {}
+    assert by_cell["wheels alone", "blind", 1.0].sensors == ("wheels",)  # it is blind anyway: the report says so
     assert len(alone.track.estimate) == len(alone.track.truth) > 20
 
 

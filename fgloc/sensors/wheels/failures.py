@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -90,6 +90,7 @@ class WheelSlip(WheelFailure):
     Added are a forward ``speed`` and a ``yaw_rate``, both times the profile, and ``share`` of what the wheels report.
     """
 
+    sizes: ClassVar[tuple[str, ...]] = ("speed", "yaw_rate", "share")
     kind: Literal["wheel_slip"] = "wheel_slip"
     speed: float = Field(0.0, description="m/s, forward")
     yaw_rate: float = Field(0.0, description="rad/s, counter-clockwise")
@@ -126,6 +127,7 @@ class EncoderDead(WheelFailure):
 class EncoderQuantized(WheelFailure):
     """Wheels are counted in whole ticks of ``tick_m`` of the wheel's surface; what is left over counts later."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("tick_m",)
     kind: Literal["encoder_quantized"] = "encoder_quantized"
     tick_m: float = Field(0.01, gt=0, description="m")
 
@@ -147,6 +149,7 @@ class EncoderQuantized(WheelFailure):
 class WheelScaleDrift(WheelFailure):
     """The wheels seem to grow: reported speeds change by these shares per minute since the recording's start."""
 
+    sizes: ClassVar[tuple[str, ...]] = ("left_per_min", "right_per_min")
     kind: Literal["wheel_scale_drift"] = "wheel_scale_drift"
     left_per_min: float = Field(0.01, description="share per minute")
     right_per_min: float = Field(0.01, description="share per minute")
