@@ -314,9 +314,11 @@ def evaluate_model(
 def _write_config(bags: list[Path], out: Path) -> None:
     """Write the training configuration that ``--init`` asks for, and print warnings and the next step."""
     from fgloc.files.outputs import write_text
+    from fgloc.recording.storage import refuse_repeats
     from fgloc_training.recordings import look, missing, training_yaml
 
     check_out(out, folder=False)
+    refuse_repeats(bags)
     found = [look(bag, configured(bag, None, None)) for bag in bags]
     write_text(out, training_yaml(found, out))
     for sentence in missing(found):

@@ -322,8 +322,10 @@ def calibrate(
     from fgloc.calibration.installation import found_text, given_text, setting_unit
     from fgloc.config import yaml_of
     from fgloc.files.outputs import write_text
+    from fgloc.recording.storage import refuse_repeats
 
     check_out(out, folder=False)
+    refuse_repeats(bags)
     spare_inputs(out, bags[0], map_file, config, force, folder=False)
     before = configured(bags[0], config, None)
     say_inputs(bags[0], map_file, config)

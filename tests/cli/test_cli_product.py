@@ -8,6 +8,7 @@ import pty
 import re
 import select
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -429,7 +430,7 @@ def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path, unset):
 
 
 def test_a_training_configuration_is_split_by_recording(tmp_path):
-    bags = [write_robot(tmp_path / "bags" / f"run{i}", truth=True) for i in range(4)]
+    bags = [write_robot(tmp_path / "bags" / f"run{i}", 8.0 + 0.02 * i, truth=True) for i in range(4)]
     file = tmp_path / "train.yaml"
     code, out, err = fgloc("train", "--init", *bags, "--out", file)
     assert code == 0
@@ -457,7 +458,7 @@ def test_a_training_configuration_reads_what_the_drive_is_commanded(tmp_path, ki
         folder.mkdir()
         (folder / "robot.yaml").write_text(f"wheels:\n  drive: {{kind: {kind}, {shape[kind]}}}\n", encoding="utf-8")
         with BagWriter(folder / "bag") as bag:
-            for k in range(60):
+            for k in range(60 + i):
                 stamp = 1_700_000_000_000_000_000 + k * 100_000_000
                 if kind == "mecanum":
                     bag.command("/cmd_vel", stamp, 0.2, 0.3, vy=0.1)
@@ -474,11 +475,22 @@ def test_a_training_configuration_reads_what_the_drive_is_commanded(tmp_path, ki
 
 
 def test_without_truth_the_smoothed_runs_are_the_truth(tmp_path):
-    bags = [write_robot(tmp_path / f"run{i}", seconds=2.0) for i in range(3)]
+    bags = [write_robot(tmp_path / f"run{i}", seconds=2.0 + i) for i in range(3)]
     file = tmp_path / "train.yaml"
     assert fgloc("train", "--init", *bags, "--out", file)[0] == 0
     content = yaml.safe_load(file.read_text())
     assert content["truth"] == {f"run{i}": f"smoothed/run{i}" for i in range(3)}
+
+
+@pytest.mark.parametrize("command", [("train", "--init"), ("calibrate",)])
+def test_one_recording_counts_once(tmp_path, command):
+    one, other = (write_robot(tmp_path / f"run{i}", seconds=2.0 + i, truth=True) for i in range(2))
+    copy = shutil.copytree(one, tmp_path / "copy")
+    for again in (one, copy, next(one.glob("*.mcap"))):
+        code, _, err = fgloc(*command, one, other, again, "--out", tmp_path / "written.yaml")
+        assert code == 1
+        assert f"{one} and {again} are the same" in err
+    assert not (tmp_path / "written.yaml").exists()
 
 
 def test_a_single_recording_or_one_without_commands_cannot_be_trained_on(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,16 @@ def test_windows_of_two_seconds_train_a_model(tmp_path: Path) -> None:
     assert card.split.test == ("test.0", "test.1", "test.2", "test.3")
     assert len(card.split.train) == 12
     assert card.figures["drift_percent_1s"] > 0.0
+
+
+def test_one_recording_does_not_train_and_validate(tmp_path: Path) -> None:
+    write_windows(tmp_path / "a" / "bag", [1])
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    settings = dict(robot="r", recordings=dict(a="a/bag", b="b/bag"), split=dict(train=["a"], validation=["b"]))
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(settings))
+    code, _, err = fgloc("train", tmp_path / "c.yaml", "--out", tmp_path / "models")
+    assert code == 1
+    assert f"a ({tmp_path / 'a' / 'bag'}) and b ({tmp_path / 'b' / 'bag'})" in err
 
 
 def test_the_gyros_bias_is_known_after_a_rest() -> None:

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from fgloc.errors import ConfigError, FglocError, RecordingError
 from fgloc.files.atomic import atomic_folder, check_out
 from fgloc.instrumentation import counted
+from fgloc.recording.storage import refuse_repeats
 from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Split
 from fgloc.sensors.learned.sensor import Tensors, load_model, model_of, read_model, save_model
@@ -408,6 +409,7 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, r
     config = load_train_config(config_file)
     check_out(out)
     made_by = f"fgloc train {config_file.as_posix()}; {config.model_dump_json()}"
+    refuse_repeats([data / bag for bag in config.recordings.values()], [*config.recordings])
     smoothed = {name: data / folder for name, folder in config.truth.items()}
     parts = {
         name: load_runs(data / bag, name, config.network.dt_s, config.data, smoothed.get(name))
