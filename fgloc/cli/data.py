@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fgloc.cli.options import BAG_HELP, configured, need
+from fgloc.cli.options import BAG_HELP, configured, need, warn_of_several_robots
 from fgloc.cli.terminal import examples, group, kept_on_interrupt, next_step, say, shown_path, warn
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
@@ -319,6 +319,7 @@ def _write_config(bags: list[Path], out: Path) -> None:
 
     check_out(out, folder=False)
     refuse_repeats(bags)
+    warn_of_several_robots(bags)
     found = [look(bag, configured(bag, None, None)) for bag in bags]
     write_text(out, training_yaml(found, out))
     for sentence in missing(found):

@@ -14,6 +14,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from fgloc.runner import run
 from fgloc.types import Decision, Finding, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import load_train_config
+from fgloc_training.recordings import Found, missing
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -493,11 +495,31 @@ def test_one_recording_counts_once(tmp_path, command):
     assert not (tmp_path / "written.yaml").exists()
 
 
+def test_configurations_that_differ_may_be_of_two_robots(tmp_path):
+    bags = [write_robot(tmp_path / f"run{i}" / "bag", seconds=2.0 + i) for i in range(3)]
+    files = [bag.parent / "robot.yaml" for bag in bags]
+    for file, track in zip(files, (0.3, 0.3, 0.4), strict=True):
+        file.write_text(f"# {file}\nwheels: {{track: {track}}}\n")
+    _, _, err = fgloc("train", "--init", *bags, "--out", tmp_path / "train.yaml")
+    (told,) = [line for line in err.splitlines() if str(files[0]) in line]
+    assert told.startswith("warning: ")
+    assert str(files[2]) in told
+    assert str(files[1]) not in err
+
+
+@pytest.mark.parametrize(("short_s", "wanted"), [(2.9, 0), (3.1, 1)])
+def test_ten_minutes_are_wanted_until_there_are_ten_as_told(short_s, wanted):
+    found = [Found(Path(name), 0.5 * (600.0 - short_s), True, (0.4, 0.5, 0.0)) for name in "ab"]
+    lacking = [text for text in missing(found) if "ten minutes" in text]
+    assert len(lacking) == wanted
+    assert all("9.9 min" in text for text in lacking)
+
+
 def test_a_single_recording_or_one_without_commands_cannot_be_trained_on(tmp_path):
     bag = write_robot(tmp_path / "run", seconds=2.0)
     code, _, err = fgloc("train", "--init", bag, "--out", tmp_path / "train.yaml")
     assert code == 1
-    assert "1 recording" in err
+    assert re.search(r"\b1 recording\b.* 2 or more\b", err)
     code, _, err = fgloc("train", bag, bag, "--out", tmp_path / "models")
     assert code == 1
     assert "2 files" in err
