@@ -457,6 +457,12 @@ class TopicsConfig(Section):
             return "none"
         return "none" if given is None and self._cameras and role in CAMERA_ROLES else given
 
+    def only(self, roles: Collection[Role]) -> Self:
+        """Copy in which no topic plays another role than these."""
+        other = self.model_copy(update={role: "none" for role in type(self).model_fields if role not in roles})
+        other._cameras = dict.fromkeys(self._cameras, "none")
+        return other
+
     def asking(self, roles: Collection[Role]) -> Self:
         """Copy that looks for topics of these roles, of `optional_roles`, as for those of all others."""
         other = self.model_copy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -14,7 +15,7 @@ from fgloc.ablation.failures import AnyFailure
 from fgloc.config import Config, Section, config_of, config_type, load_config, robot_file
 from fgloc.errors import ConfigError
 from fgloc.files.settings import Settings, joined, merged, refuse_misplaced, sentences
-from fgloc.recording.storage import find_beside
+from fgloc.recording.storage import find_beside, refuse_repeats
 from fgloc.replay import RunMode
 
 _MOST_RUNS = 1_000_000
@@ -179,7 +180,9 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
 
     Raises:
         ConfigError: a recording, map or configuration is missing, or a variant's configuration is wrong.
+        RecordingError: two entries that differ by nothing else have the same recording.
     """
+    _refuse_repeats(suite, folder)
     cells = []
     for entry, variant in product(suite.recordings, suite.variants):
         bag = folder / entry.bag
@@ -203,6 +206,14 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
             for severity, chain in failure.severities():
                 cells.append(Cell(**common, failure=failure.name, severity=severity, seed=seed, chain=chain))
     return cells
+
+
+def _refuse_repeats(suite: Suite, folder: Path) -> None:
+    alike: dict[str, list[RecordingEntry]] = defaultdict(list)
+    for entry in suite.recordings:
+        alike[entry.model_dump_json(exclude={"name", "bag"})].append(entry)
+    for entries in alike.values():
+        refuse_repeats([folder / entry.bag for entry in entries], [entry.name for entry in entries])
 
 
 def _varied(base: Config, entry: RecordingEntry, variant: Variant, folder: Path) -> Config:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fgloc.cli.options import BAG_HELP, configured, need
+from fgloc.cli.options import BAG_HELP, configured, need, warn_of_several_robots
 from fgloc.cli.terminal import examples, group, kept_on_interrupt, next_step, say, shown_path, warn
 from fgloc.errors import ConfigError
 from fgloc.files.atomic import check_out
@@ -314,9 +314,12 @@ def evaluate_model(
 def _write_config(bags: list[Path], out: Path) -> None:
     """Write the training configuration that ``--init`` asks for, and print warnings and the next step."""
     from fgloc.files.outputs import write_text
+    from fgloc.recording.storage import refuse_repeats
     from fgloc_training.recordings import look, missing, training_yaml
 
     check_out(out, folder=False)
+    refuse_repeats(bags)
+    warn_of_several_robots(bags)
     found = [look(bag, configured(bag, None, None)) for bag in bags]
     write_text(out, training_yaml(found, out))
     for sentence in missing(found):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 
+from fgloc.cli.terminal import warn
 from fgloc.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
@@ -93,6 +95,18 @@ def configured(bag: Path | None, config_file: Path | None, model: Path | None) -
         return with_model(config, model)
     except ValidationError as error:
         raise ConfigError(f"--model: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+
+
+def warn_of_several_robots(bags: Sequence[Path]) -> None:
+    """Warn if the configurations beside the recordings say other things: they may be of two robots."""
+    from fgloc.files.settings import Settings
+    from fgloc.recording.storage import find_beside
+
+    found = dict.fromkeys(find_beside(bag, "robot.yaml") for bag in bags)
+    files = [Settings(file, "give the robot's") for file in found if file is not None]
+    for file in files[1:]:
+        if file.content != files[0].content:
+            warn(f"{files[0].path} and {file.path} differ: expected recordings of one robot, and one configuration")
 
 
 _RESULTS = ("map.yaml", "installation.yaml")  # of a result folder, which the next run may read

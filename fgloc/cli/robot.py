@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgloc.cli.options import Bag, Bags, ConfigOption, ForceOption, MapOption, ModelOption, configured, spare_inputs
+from fgloc.cli.options import (
+    Bag,
+    Bags,
+    ConfigOption,
+    ForceOption,
+    MapOption,
+    ModelOption,
+    configured,
+    spare_inputs,
+    warn_of_several_robots,
+)
 from fgloc.cli.terminal import (
     EXIT_LOST,
     ask,
@@ -308,6 +318,14 @@ def _bending(bags: Sequence[Path], map_file: Path | None, before: Config, after:
     return texts
 
 
+def _commanded(bag: Path, config: Config) -> bool:
+    """Whether a recording holds commands, which training reads."""
+    from fgloc.recording.reader import Recording
+
+    with Recording(bag, config.recording) as recording:
+        return "command" in recording.roles
+
+
 def calibrate(
     bags: Bags,
     out: Annotated[
@@ -326,11 +344,15 @@ def calibrate(
     from fgloc.calibration.installation import found_text, given_text, setting_unit
     from fgloc.config import yaml_of
     from fgloc.files.outputs import write_text
+    from fgloc.recording.storage import refuse_repeats
 
     check_out(out, folder=False)
+    refuse_repeats(bags)
     spare_inputs(out, bags[0], map_file, config, force, folder=False)
     before = configured(bags[0], config, None)
     say_inputs(bags[0], map_file, config)
+    if config is None:
+        warn_of_several_robots(bags)
     with run_bar("calibrate") as progress:
         after, settings = calibrated(bags, map_file, before, progress)
     write_text(out, f"# {typed()}\n{yaml_of(after, out.parent)}")
@@ -342,6 +364,7 @@ def calibrate(
             say_remark("error", text, err=True)
         say("not to be trusted: what is wrong there was fitted by the constants above; correct it first", err=True)
         raise typer.Exit(EXIT_LOST)
-    paths = " ".join(shown_path(bag) for bag in bags)
-    next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")
+    if len(bags) > 1 and all(_commanded(bag, before) for bag in bags):
+        paths = " ".join(shown_path(bag) for bag in bags)
+        next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")
     next_step(f"fgloc smooth {shown_path(bags[-1])} --config {shown_path(out)} --out result", "the best estimate")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -67,7 +67,7 @@ def read_results(folder: Path | str) -> Results:
     _check_format(provenance.get("format", 0), folder)
     trajectory = _read_trajectory(folder)
     decisions = _read_steps(folder / "steps.csv")
-    named = {d.stamp_ns: _MODES[d.reason] for d in decisions if d.kind == "mode" and d.reason in _MODES}
+    named = _named(decisions)
     map_file = folder / "map.yaml"
     return Results(
         folder=folder,
@@ -78,6 +78,22 @@ def read_results(folder: Path | str) -> Results:
         provenance=provenance,
         landmarks=load_map(map_file) if map_file.is_file() else None,
     )
+
+
+def read_modes(steps: Path) -> dict[int, Mode]:
+    """Modes of the poses that are not `Mode.OK`, by stamp [ns].
+
+    Args:
+        steps: the ``steps.csv`` of a run.
+
+    Raises:
+        TrajectoryError: it is missing, or a line of it is not what a run writes.
+    """
+    return _named(_read_steps(steps))
+
+
+def _named(decisions: Iterable[Decision]) -> dict[int, Mode]:
+    return {d.stamp_ns: _MODES[d.reason] for d in decisions if d.kind == "mode" and d.reason in _MODES}
 
 
 def _check_format(written: object, folder: Path) -> None:

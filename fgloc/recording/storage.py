@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import filecmp
 import hashlib
 import heapq
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -174,6 +177,33 @@ def find_files(path: Path, notes: list[str]) -> tuple[BagMetadata | None, tuple[
     damaged = (path / "metadata.yaml").exists()
     notes.append(Grave(f"metadata.yaml is damaged: {opened}") if damaged else f"metadata.yaml is missing: {opened}")
     return None, tuple(files)
+
+
+def refuse_repeats(bags: Sequence[Path], names: Sequence[str] = ()) -> None:
+    """Refuse recordings of which two are the same, by another path or as a copy.
+
+    What is no recording is passed over: reading it says why.
+
+    Args:
+        bags: recordings.
+        names: what the user calls each; empty: by its path.
+
+    Raises:
+        RecordingError: the storage files of two are the same, or hold the same bytes.
+    """
+    labels = [f"{name} ({bag})" for name, bag in zip(names, bags, strict=True)] if names else [str(bag) for bag in bags]
+    found: list[tuple[str, tuple[Path, ...]]] = []
+    for label, bag in zip(labels, bags, strict=True):
+        with suppress(RecordingError):
+            found.append((label, find_files(bag, [])[1]))
+    for (first, its), (second, others) in combinations(found, 2):
+        if len(its) == len(others) and all(map(_same, its, others)):
+            raise RecordingError(f"{first} and {second} are the same recording; give each recording once")
+
+
+def _same(file: Path, other: Path) -> bool:
+    """Whether two files are one, or have the same content; that of files of different sizes is not read."""
+    return file.samefile(other) or filecmp.cmp(file, other, shallow=False)
 
 
 def _metadata_of(file: Path) -> BagMetadata | None:

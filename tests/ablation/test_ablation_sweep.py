@@ -15,12 +15,13 @@ import psutil
 import pytest
 import yaml
 from attempts import attempts
+from refusal import refusal
 
 from fgloc import se2
 from fgloc.ablation.jobs import execute, make_jobs, read_record, record_path
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.ablation.sweep import _client, sweep
-from fgloc.errors import ConfigError
+from fgloc.errors import ConfigError, RecordingError
 from fgloc_datasets.bag import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
@@ -80,6 +81,13 @@ def jobs_of(folder, **changes):
     path = folder / f"changed{abs(hash(str(changes)))}.yaml"
     path.write_text(yaml.safe_dump(SUITE | changes))
     return make_jobs(expand(load_suite(path), folder))
+
+
+def test_one_recording_under_two_names_differs_by_its_settings_at_least(folder):
+    one, two = {"name": "circle", "bag": "bag"}, {"name": "again", "bag": "./bag"}
+    with refusal(RecordingError, "circle", "again"):
+        jobs_of(folder, recordings=[one, two])
+    assert jobs_of(folder, recordings=[one, two | {"settings": {"recording": {"topics": {"truth": "none"}}}}])
 
 
 @pytest.fixture(scope="module")

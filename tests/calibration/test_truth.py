@@ -62,7 +62,7 @@ def write_tricycle(folder, seconds=80.0, truth=True):
 GAINS = Config.model_validate({"truth": {"align": "se2"}})
 
 
-def write_odometry(folder, told=lambda k: True, n=409):
+def write_odometry(folder, told=lambda k: True, n=409, commands=False):
     """An odometer that reports too short a way, and a truth of the body, late; as a default just enough of it."""
     rng = np.random.default_rng(5)
     pose, reported = np.zeros(3), np.zeros(3)
@@ -71,6 +71,8 @@ def write_odometry(folder, told=lambda k: True, n=409):
             t, stamp = 0.1 * k, START_NS + k * 100_000_000
             v, omega = 0.5 + 0.2 * math.sin(0.2 * t), 0.6 * math.sin(0.4 * t) + 0.3 * math.sin(1.1 * t)
             bag.odometry("/odom", stamp, reported.tolist(), (v / 1.05, omega))
+            if commands:
+                bag.command("/cmd_vel", stamp, v, omega)
             x, y, yaw = se2.compose(pose, BODY) + rng.normal(0.0, 0.002, 3)
             if told(k):
                 turned = (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
@@ -171,6 +173,17 @@ def test_a_radius_that_the_truth_corrects_is_no_mistake_any_more(tmp_path):
     assert done.exit_code == 0, done.output
     found = load_config(tmp_path / "found.yaml").wheels.drive.radius
     assert found == pytest.approx(0.1, abs=0.001)
+
+
+@pytest.mark.parametrize(("commanded", "follows"), [((True, True), True), ((True,), False), ((True, False), False)])
+def test_training_follows_where_it_accepts_the_recordings(tmp_path, commanded, follows):
+    bags = [write_odometry(tmp_path / f"run{i}", n=500 + i, commands=given) for i, given in enumerate(commanded)]
+    (tmp_path / "robot.yaml").write_text("truth: {align: se2}\n")
+    given = ["calibrate", *map(str, bags), "--config", str(tmp_path / "robot.yaml"), "--out", str(tmp_path / "r.yaml")]
+    done = CliRunner().invoke(cli.app, given)
+    assert done.exit_code == 0, done.output
+    assert ("next: fgloc train --init" in done.output) == follows
+    assert "next: fgloc smooth" in done.output
 
 
 def test_wheels_that_do_not_follow_the_truth_are_named(tmp_path):

@@ -8,11 +8,13 @@ import pty
 import re
 import select
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +34,7 @@ from fgloc.sensors.maps import load_map, write_map
 from fgloc.types import Decision, Finding, Severity, ordered
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.config import load_train_config
+from fgloc_training.recordings import Found, missing
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -430,7 +433,7 @@ def test_init_takes_receive_times_for_stamps_of_another_clock(tmp_path, unset):
 
 
 def test_a_training_configuration_is_split_by_recording(tmp_path):
-    bags = [write_robot(tmp_path / "bags" / f"run{i}", truth=True) for i in range(4)]
+    bags = [write_robot(tmp_path / "bags" / f"run{i}", 8.0 + 0.02 * i, truth=True) for i in range(4)]
     file = tmp_path / "train.yaml"
     code, out, err = fgloc("train", "--init", *bags, "--out", file)
     assert code == 0
@@ -458,7 +461,7 @@ def test_a_training_configuration_reads_what_the_drive_is_commanded(tmp_path, ki
         folder.mkdir()
         (folder / "robot.yaml").write_text(f"wheels:\n  drive: {{kind: {kind}, {shape[kind]}}}\n", encoding="utf-8")
         with BagWriter(folder / "bag") as bag:
-            for k in range(60):
+            for k in range(60 + i):
                 stamp = 1_700_000_000_000_000_000 + k * 100_000_000
                 if kind == "mecanum":
                     bag.command("/cmd_vel", stamp, 0.2, 0.3, vy=0.1)
@@ -475,18 +478,49 @@ def test_a_training_configuration_reads_what_the_drive_is_commanded(tmp_path, ki
 
 
 def test_without_truth_the_smoothed_runs_are_the_truth(tmp_path):
-    bags = [write_robot(tmp_path / f"run{i}", seconds=2.0) for i in range(3)]
+    bags = [write_robot(tmp_path / f"run{i}", seconds=2.0 + i) for i in range(3)]
     file = tmp_path / "train.yaml"
     assert fgloc("train", "--init", *bags, "--out", file)[0] == 0
     content = yaml.safe_load(file.read_text())
     assert content["truth"] == {f"run{i}": f"smoothed/run{i}" for i in range(3)}
 
 
+@pytest.mark.parametrize("command", [("train", "--init"), ("calibrate",)])
+def test_one_recording_counts_once(tmp_path, command):
+    one, other = (write_robot(tmp_path / f"run{i}", seconds=2.0 + i, truth=True) for i in range(2))
+    copy = shutil.copytree(one, tmp_path / "copy")
+    for again in (one, copy, next(one.glob("*.mcap"))):
+        code, _, err = fgloc(*command, one, other, again, "--out", tmp_path / "written.yaml")
+        assert code == 1
+        assert f"{one} and {again} are the same" in err
+    assert not (tmp_path / "written.yaml").exists()
+
+
+def test_configurations_that_differ_may_be_of_two_robots(tmp_path):
+    bags = [write_robot(tmp_path / f"run{i}" / "bag", seconds=2.0 + i) for i in range(3)]
+    files = [bag.parent / "robot.yaml" for bag in bags]
+    for file, track in zip(files, (0.3, 0.3, 0.4), strict=True):
+        file.write_text(f"# {file}\nwheels: {{track: {track}}}\n")
+    _, _, err = fgloc("train", "--init", *bags, "--out", tmp_path / "train.yaml")
+    (told,) = [line for line in err.splitlines() if str(files[0]) in line]
+    assert told.startswith("warning: ")
+    assert str(files[2]) in told
+    assert str(files[1]) not in err
+
+
+@pytest.mark.parametrize(("short_s", "wanted"), [(2.9, 0), (3.1, 1)])
+def test_ten_minutes_are_wanted_until_there_are_ten_as_told(short_s, wanted):
+    found = [Found(Path(name), 0.5 * (600.0 - short_s), True, (0.4, 0.5, 0.0)) for name in "ab"]
+    lacking = [text for text in missing(found) if "ten minutes" in text]
+    assert len(lacking) == wanted
+    assert all("9.9 min" in text for text in lacking)
+
+
 def test_a_single_recording_or_one_without_commands_cannot_be_trained_on(tmp_path):
     bag = write_robot(tmp_path / "run", seconds=2.0)
     code, _, err = fgloc("train", "--init", bag, "--out", tmp_path / "train.yaml")
     assert code == 1
-    assert "1 recording" in err
+    assert re.search(r"\b1 recording\b.* 2 or more\b", err)
     code, _, err = fgloc("train", bag, bag, "--out", tmp_path / "models")
     assert code == 1
     assert "2 files" in err

@@ -16,10 +16,10 @@ from synthetic_robot import DELAY, SECOND, T0, TAU, drive, synthetic, write_bag
 from fgloc import se2
 from fgloc.config import NoiseDensity, config_of
 from fgloc.errors import RecordingError, TrajectoryError
-from fgloc.files.outputs import write_covariance_csv, write_tum
+from fgloc.files.outputs import write_covariance_csv, write_steps_csv, write_tum
 from fgloc.sensors.learned.card import ErrorMemory, Kinematics
 from fgloc.sensors.wheels.events import JointsEvent
-from fgloc.types import ControlEvent, Trajectory
+from fgloc.types import ControlEvent, Decision, Trajectory
 from fgloc_datasets.bag import BagWriter
 from fgloc_training.calibrate import fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, nis, noise_covs
 from fgloc_training.config import CalibrationConfig, DataConfig, OptimizationConfig
@@ -114,6 +114,28 @@ def test_smoothed_trajectory_stands_in_for_the_truth(tmp_path: Path) -> None:
     (folder / "covariance.csv").write_text("stamp,xx\n1.0,oops\n")
     with refusal(TrajectoryError, folder / "covariance.csv", "oops"):
         load_run(tmp_path / "bag", "b", 0.1, 2.0, config, folder)
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_poses_of_a_lost_robot_are_no_truth(tmp_path: Path, sure: bool) -> None:
+    """By the run's own word, whatever its covariance says."""
+    write_bag(tmp_path / "bag", 4, 20.0)
+    _, stamps, poses = drive(np.random.default_rng(4), 20.0)
+    stamps, poses = stamps[::10], poses[::10]
+    folder = tmp_path / "smoothed"
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, poses))
+    if sure:
+        covs = np.tile(1e-6 * np.eye(3), (len(stamps), 1, 1))
+        write_covariance_csv(folder / "covariance.csv", Trajectory(stamps, poses, covs))
+    rows = [Decision(k, stamp, "mode", -1, 1.0, math.nan, 0, 0.0, "lost") for k, stamp in enumerate(stamps.tolist())]
+    write_steps_csv(folder / "steps.csv", rows[80:110])
+    run = load_run(tmp_path / "bag", "b", 0.1, 2.0, DataConfig(), folder)
+    at = run.times + (run.origin_ns - T0) * 1e-9
+    assert not run.valid[(at > 8.0) & (at < 10.9)].any()
+    assert run.valid[(at < 7.6) | (at > 11.4)].all()
+    write_steps_csv(folder / "steps.csv", rows)
+    with refusal(TrajectoryError, folder, "LOST", len(rows)):
+        load_run(tmp_path / "bag", "b", 0.1, 2.0, DataConfig(), folder)
 
 
 def test_part_of_a_run_equals_the_run() -> None:

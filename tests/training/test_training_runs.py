@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from command_line import fgloc
+from refusal import refusal
 from synthetic_robot import JOINTS, RADIUS, SECOND, T0, TRACK, drive, sensed, sensing
 
 from fgloc.config import Config, WheelsConfig
@@ -27,16 +29,23 @@ MODEL = Path(learned_sensor.__file__).parent / "models" / "mrclam" / "all.safete
 SHORT = DataConfig(smoothing_s=0.2, margin_s=0.0, history_s=0.3, shortest_s=1.5)
 
 
-def write_windows(path: Path, seeds: list[int], seconds: float = 2.5, apart_s: float = 100.0) -> None:
-    """Short drives, each of another seed, far apart."""
+def write_windows(
+    path: Path, seeds: list[int], seconds: float = 2.5, apart_s: float = 100.0, every: int = 5, late_s: float = 0.0
+) -> None:
+    """Short drives, each of another seed, far apart, with a truth at 100 Hz by ``every``."""
     with BagWriter(path) as bag:
         for k, seed in enumerate(seeds):
             later = round(k * apart_s * SECOND)
             commands, stamps, poses = drive(np.random.default_rng(seed), seconds)
             for c in commands:
                 bag.command("/cmd_vel", c.stamp_ns + later, c.v, c.omega)
-            for stamp, (x, y, yaw) in zip(stamps[::5].tolist(), poses[::5], strict=True):
-                bag.truth("/truth", stamp + later, [x, y, 0.0], [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
+            for stamp, (x, y, yaw) in zip(stamps[::every].tolist(), poses[::every], strict=True):
+                bag.truth(
+                    "/truth",
+                    stamp + later + round(late_s * SECOND),
+                    [x, y, 0.0],
+                    [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)],
+                )
 
 
 def test_a_recording_that_falls_silent_is_several_runs(tmp_path: Path) -> None:
@@ -86,6 +95,45 @@ def test_windows_of_two_seconds_train_a_model(tmp_path: Path) -> None:
     assert card.split.test == ("test.0", "test.1", "test.2", "test.3")
     assert len(card.split.train) == 12
     assert card.figures["drift_percent_1s"] > 0.0
+
+
+@pytest.mark.parametrize("sparse", ["a", "b"])
+def test_a_recording_without_samples_is_named_before_the_training(tmp_path: Path, sparse: str) -> None:
+    for seed, name in enumerate("ab"):
+        write_windows(tmp_path / name / "bag", [seed], 20.0, every=20 if name == sparse else 5)
+    settings = dict(robot="r", recordings=dict(a="a/bag", b="b/bag"), split=dict(train=["a"], validation=["b"]))
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(settings))
+    code, _, err = fgloc("train", tmp_path / "c.yaml", "--out", tmp_path / "models")
+    assert code == 1
+    assert f"{sparse} (0.0 of " in err
+    assert "data.max_truth_gap_s" in err
+
+
+def test_commands_and_truth_that_never_overlap_are_named(tmp_path: Path) -> None:
+    write_windows(tmp_path / "bag", [1], late_s=3600.0)
+    with refusal(RecordingError, tmp_path / "bag", "2 stretches", "commands and truth"):
+        load_runs(tmp_path / "bag", "w", 0.1, SHORT)
+
+
+def test_topics_that_training_does_not_read_may_be_missing(tmp_path: Path) -> None:
+    write_windows(tmp_path / "bag", [1])
+    shared = tmp_path / "robot.yaml"
+    shared.write_text("recording: {topics: {sightings: /camera/landmarks}}\n")
+    assert load_runs(tmp_path / "bag", "w", 0.1, SHORT)
+    shared.write_text("recording: {topics: {sightings: /camera/landmarks, command: /drive}}\n")
+    with refusal(RecordingError, "/drive") as caught:
+        load_runs(tmp_path / "bag", "w", 0.1, SHORT)
+    assert "/camera/landmarks" not in str(caught.value)
+
+
+def test_one_recording_does_not_train_and_validate(tmp_path: Path) -> None:
+    write_windows(tmp_path / "a" / "bag", [1])
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    settings = dict(robot="r", recordings=dict(a="a/bag", b="b/bag"), split=dict(train=["a"], validation=["b"]))
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(settings))
+    code, _, err = fgloc("train", tmp_path / "c.yaml", "--out", tmp_path / "models")
+    assert code == 1
+    assert f"a ({tmp_path / 'a' / 'bag'}) and b ({tmp_path / 'b' / 'bag'})" in err
 
 
 def test_the_gyros_bias_is_known_after_a_rest() -> None:

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.signal import savgol_filter
 
-from fgloc.config import Config, GyroConfig, WheelsConfig, load_config
+from fgloc.config import Config, GyroConfig, RecordingConfig, WheelsConfig, load_config
 from fgloc.errors import RecordingError, TrajectoryError
+from fgloc.evaluation.results import read_modes
 from fgloc.files.outputs import read_tum
 from fgloc.frames import rotations
 from fgloc.intake.keyframing import EventBuffer
-from fgloc.recording.reader import open_recording
+from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import base_ground, base_pose, lacks_yaw
 from fgloc.sensor_setup import mounted_up
 from fgloc.sensors.base import Mounting, WheelJoints
@@ -33,7 +34,7 @@ from fgloc.sensors.learned.card import Signals, signals_of
 from fgloc.sensors.learned.network import CommandHistory
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, MotionEvent, Step, TruthEvent
+from fgloc.types import ControlEvent, Event, FloatArray, InertialEvent, Mode, MotionEvent, Step, TruthEvent
 from fgloc_training.config import DataConfig
 
 # --- Inputs of a motion model, as recorded ----------------------------------------------------------------------------
@@ -245,6 +246,34 @@ class Run:
         return np.asarray(k[broken[k + steps + 1] == broken[k]], dtype=np.int64)
 
 
+def need_windows(runs: Sequence[Run], window_s: float, purpose: str) -> None:
+    """Make sure that samples can be made of some recordings.
+
+    Args:
+        runs: those that train, or those that validate.
+        window_s: time for which there has to be a truth throughout.
+        purpose: what the samples are for.
+
+    Raises:
+        RecordingError: none of the runs has such a window.
+    """
+    if any(len(run.starts(round(window_s / run.dt_s))) for run in runs):
+        return
+    raise RecordingError(
+        f"no samples to {purpose}: no {window_s:g} s of unbroken truth in {', '.join(map(_validity, runs))}. Gaps of "
+        "the truth (data.max_truth_gap_s) are left out, sideways motion (data.max_sideways_mps) and, of a smoothed "
+        "truth, poses that are LOST or too unsure (data.max_truth_sigma_m): record or smooth anew, or raise the limits"
+    )
+
+
+def _validity(run: Run) -> str:
+    """A run's name, with how much of it has a truth."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], run.valid, [False]]).astype(int)))
+    longest = max(ends[1::2] - ends[::2], default=0) * run.dt_s
+    known, whole = run.valid.sum() * run.dt_s, len(run.valid) * run.dt_s
+    return f"{run.name} ({known:.1f} of {whole:.1f} s, at most {longest:.1f} s at a time)"
+
+
 def load_run(
     path: Path, name: str, dt_s: float, history_s: float, config: DataConfig, truth_from: Path | None = None
 ) -> Run:
@@ -288,6 +317,7 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
         record = SensorRecord(whole.sensed, whole.settings, whole.imu_up, whole.truth)
         return {name: make_run(name, record, stamps, poses, dt_s, config.history_s, config)}
     runs: dict[str, Run] = {}
+    both = False
     sensed = sorted(whole.sensed, key=lambda e: e.stamp_ns)
     sensed_ns = [e.stamp_ns for e in sensed]
     for k, (first, last) in enumerate(pairwise(limits)):
@@ -295,9 +325,15 @@ def load_runs(path: Path, name: str, dt_s: float, config: DataConfig, truth_from
         inside = (stamps >= first) & (stamps < last)
         if not inside.any() or not any(isinstance(event, ControlEvent) for event in part):
             continue
+        both = True
         record, label = SensorRecord(part, whole.settings, whole.imu_up, whole.truth), f"{name}.{k}"
         with suppress(RecordingError):
             runs[label] = make_run(label, record, stamps[inside], poses[inside], dt_s, config.history_s, config)
+    if not both:
+        raise RecordingError(
+            f"{path}: none of {len(limits) - 1} stretches between silences has both commands and truth; check their "
+            "stamps with `fgloc info`"
+        )
     if not runs:
         raise RecordingError(f"{path}: {len(limits) - 1} stretches, each shorter than {config.shortest_s:g} s")
     return runs
@@ -317,7 +353,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
     settings = _settings(path)
     truth: list[TruthEvent] = []
     sensed: list[Event] = []
-    with open_recording(path, settings.recording) as recording:
+    with _opened(path, settings.recording) as recording:
         for event in recording.events():
             if isinstance(event, TruthEvent):
                 truth.append(event)
@@ -339,6 +375,22 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
             "its folder as the truth of the training"
         )
     return _Recorded(settings, sensed, (stamps, rows), up)
+
+
+_READ = ("command", "joints", "imu", "odometry", "truth")
+
+
+def _opened(path: Path, config: RecordingConfig) -> Recording:
+    """The recording; topics that training does not read may be missing or ambiguous.
+
+    Raises:
+        RecordingError: it cannot be read, or one of the other topics is missing or ambiguous.
+    """
+    recording = Recording(path, config)
+    if not recording.problems:
+        return recording
+    recording.close()
+    return open_recording(path, config.model_copy(update={"topics": config.topics.only(_READ)}))
 
 
 def make_run(
@@ -383,10 +435,11 @@ def make_run(
 
 
 def smoothed_truth(path: Path, config: DataConfig) -> tuple[NDArray[np.int64], FloatArray]:
-    """Stamps and poses ``(m, 3)`` of a smoothed trajectory, without those that its covariance says little of.
+    """Stamps and poses ``(m, 3)`` of a smoothed trajectory, without those that are LOST or too unsure.
 
     Args:
-        path: a folder that `fgloc smooth` wrote, or a TUM file; ``covariance.csv`` beside the file is read if there.
+        path: a folder that `fgloc smooth` wrote, or a TUM file; ``steps.csv`` and ``covariance.csv`` beside the file
+            are read if there.
         config: ``max_truth_sigma_m`` bounds the standard deviation of the position.
 
     Raises:
@@ -394,20 +447,28 @@ def smoothed_truth(path: Path, config: DataConfig) -> tuple[NDArray[np.int64], F
     """
     tum = path / "trajectory.tum" if path.is_dir() else path
     trajectory = read_tum(tum)
-    table = tum.with_name("covariance.csv")
+    steps, table = tum.with_name("steps.csv"), tum.with_name("covariance.csv")
+    modes = read_modes(steps) if steps.is_file() else {}
+    known = ~np.isin(trajectory.stamps_ns, [stamp for stamp, mode in modes.items() if mode is Mode.LOST])
+    if not known.any():
+        raise TrajectoryError(
+            f"{path}: the robot was LOST at each of its {len(trajectory)} poses, which are no truth; see its "
+            "report.html, smooth the recording again, or leave it out"
+        )
     if config.max_truth_sigma_m is None or not table.is_file():
-        return trajectory.stamps_ns, trajectory.poses
+        return trajectory.stamps_ns[known], trajectory.poses[known]
     try:
         variances = np.loadtxt(table, delimiter=",", skiprows=1, usecols=(1, 4), ndmin=2)
     except (OSError, ValueError) as error:
         raise TrajectoryError(f"{table}: not a table of covariances ({error}); write it with `fgloc smooth`") from error
     if len(variances) != len(trajectory):
         raise TrajectoryError(f"{table}: {len(variances)} rows, {tum} has {len(trajectory)}; both come from one run")
-    known = variances.sum(axis=1) <= config.max_truth_sigma_m**2
+    best = np.sqrt(variances[known].sum(axis=1).min())
+    known &= variances.sum(axis=1) <= config.max_truth_sigma_m**2
     if not known.any():
         raise TrajectoryError(
-            f"{tum}: no pose is known to {config.max_truth_sigma_m} m, the best to "
-            f"{np.sqrt(variances.sum(axis=1).min()):.3f} m; raise data.max_truth_sigma_m"
+            f"{tum}: no pose is known to {config.max_truth_sigma_m} m, the best to {best:.3f} m; "
+            "raise data.max_truth_sigma_m"
         )
     return trajectory.stamps_ns[known], trajectory.poses[known]
 

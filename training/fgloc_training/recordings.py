@@ -22,7 +22,7 @@ from fgloc_training.evaluate import save
 
 # --- First configuration ----------------------------------------------------------------------------------------------
 
-_WANTED_S = 600.0  # of driving in all, that training takes to know a robot
+_WANTED_MIN = 10.0  # of driving in all, that training takes to know a robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,10 @@ def look(bag: Path, config: Config) -> Found:
 def missing(found: Sequence[Found]) -> list[str]:
     """Recordings that are still needed, one sentence each."""
     sentences = []
-    total = sum(f.duration_s for f in found)
-    if total < _WANTED_S:
+    minutes = round(sum(f.duration_s for f in found) / 60.0, 1)  # as it is told
+    if minutes < _WANTED_MIN:
         sentences.append(
-            f"{total / 60.0:.1f} min of driving in all: record ten minutes, turning both ways, stopping and starting"
+            f"{minutes:.1f} min of driving in all: record ten minutes, turning both ways, stopping and starting"
         )
     if len(found) < 3:
         sentences.append("2 recordings train and validate, none is left to test: record a third")
@@ -81,8 +81,8 @@ def training_yaml(found: Sequence[Found], file: Path, robot: str = "my robot") -
     """
     if len(found) < 2:
         raise ConfigError(
-            f"got {len(found)} recording, expected three or more: some train, one validates, one tests. The split is "
-            "by recording, never within one, or the model would be judged by what it has learned"
+            f"got {len(found)} recording, expected 2 or more: one validates, others train, and of 3 or more one "
+            "tests. The split is by recording, never within one, or the model would be judged by what it has learned"
         )
     names = _names([f.bag for f in found])
     held = max(1, len(names) // 5)  # of each kind that does not train

@@ -21,12 +21,13 @@ from matplotlib.figure import Figure
 from fgloc.errors import ConfigError, FglocError, RecordingError
 from fgloc.files.atomic import atomic_folder, check_out
 from fgloc.instrumentation import counted
+from fgloc.recording.storage import refuse_repeats
 from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Split
 from fgloc.sensors.learned.sensor import Tensors, load_model, model_of, read_model, save_model
 from fgloc_training.calibrate import adapted, fit_joint, fit_kinematics, fit_lag, fit_noise, fit_variance, noise_covs
 from fgloc_training.config import CalibrationConfig, NetworkConfig, TrainConfig, load_train_config
-from fgloc_training.data import Run, load_runs
+from fgloc_training.data import Run, load_runs, need_windows
 from fgloc_training.evaluate import STEP_S, card_figures, save, told_worth, worth
 from fgloc_training.models import DisplacementNet, MotionNet, NaiveNet, Trunk, VelocityNet
 from fgloc_training.optimize import Checkpoints, Curve, train_mean, train_variance
@@ -408,6 +409,7 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, r
     config = load_train_config(config_file)
     check_out(out)
     made_by = f"fgloc train {config_file.as_posix()}; {config.model_dump_json()}"
+    refuse_repeats([data / bag for bag in config.recordings.values()], [*config.recordings])
     smoothed = {name: data / folder for name, folder in config.truth.items()}
     parts = {
         name: load_runs(data / bag, name, config.network.dt_s, config.data, smoothed.get(name))
@@ -430,6 +432,9 @@ def _train_all(
     config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints, reporter: Reporter
 ) -> None:
     """Train the model of the configuration's split, or one for each recording left out, and one of all."""
+    splits = leave_one_out(list(runs)) if config.split is None else [config.split]
+    for split in splits:
+        _check_samples(config, split, runs)
     trained = list(runs) if config.split is None else config.split.train
     found = controls([runs[name] for name in trained], config.limits)
     draw_controls(out / "controls.png", found)
@@ -441,12 +446,24 @@ def _train_all(
         reporter.say(_figures(path, card, runs))
         return
     folds = []
-    for split in leave_one_out(list(runs)):
+    for split in splits:
         path = out / f"without_{split.test[0]}.safetensors"
         folds.append(train(config, split, runs, path, made_by, checkpoints, reporter.warn))
         reporter.say(_figures(path, folds[-1], runs))
     path = out / "all.safetensors"
     reporter.say(_figures(path, train_on_all(config, runs, folds, path, made_by, checkpoints), {}))
+
+
+def _check_samples(config: TrainConfig, split: Split, runs: dict[str, Run]) -> None:
+    """Raise the `RecordingError` of `need_windows` before hours of training, not after."""
+    plan = config.optimization
+    if config.network.kind in ("naive", "lag"):  # fitted whole
+        train_s, validate_s = config.network.dt_s, min(config.calibration.horizons_s)
+    else:
+        train_s = max(plan.horizon_s, plan.variance_horizon_s)
+        validate_s = max(min(plan.validation_s), plan.variance_horizon_s)
+    need_windows([runs[name] for name in split.train], train_s, "train on")
+    need_windows([runs[name] for name in split.validation], validate_s, "validate on")
 
 
 def _in_parts(split: Split, parts: dict[str, dict[str, Run]]) -> Split:
