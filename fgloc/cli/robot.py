@@ -341,6 +341,7 @@ def calibrate(
     Exit code 3: without a map, something else of the set-up is wrong, and the constants are bent by it.
     """
     from fgloc.calibrate import calibrate as calibrated
+    from fgloc.calibrate import only_truth
     from fgloc.calibration.installation import found_text, given_text, setting_unit
     from fgloc.config import yaml_of
     from fgloc.files.outputs import write_text
@@ -364,6 +365,9 @@ def calibrate(
             say_remark("error", text, err=True)
         say("not to be trusted: what is wrong there was fitted by the constants above; correct it first", err=True)
         raise typer.Exit(EXIT_LOST)
+    if len(bags) == 1 and only_truth(bags[0], before):
+        text = "the noise is that of the wheels within one drive; they differ more from drive to drive: give several"
+        say_remark("note", text)
     if len(bags) > 1 and all(_commanded(bag, before) for bag in bags):
         paths = " ".join(shown_path(bag) for bag in bags)
         next_step(f"fgloc train --init {paths} --out train.yaml", "learn how this robot moves; or smooth with it:")

@@ -280,12 +280,17 @@ def _timed(result: RunData) -> list[Finding]:
 def _elsewhere(result: RunData, config: Config, matched: Matched) -> Finding | None:
     """Finding that the truth is not in the frame of the run: of its first pose, of anchors or positions, of a map.
 
-    On a map a trajectory that a motion lays onto the truth is a right one, unless the robot was lost.
+    On a map a trajectory that a motion lays onto the truth is a right one, unless the robot was lost or hardly knew
+    where it was.
     """
     at_origin = np.allclose(result.trajectory.poses[0], 0.0, atol=_ORIGIN)
+    placed = result.landmarks is not None and not len(result.landmarks)  # by anchors or positions
+    apart = float(np.median(np.hypot(*(matched.truth - matched.estimate)[:, :2].T)))
+    sigmas = np.zeros(1) if matched.covs is None else np.sqrt(matched.covs[:, 0, 0] + matched.covs[:, 1, 1])
+    unsure = apart < _ELSEWHERE_SIGMAS * float(np.median(sigmas))
     lost = sum(mode is Mode.LOST for mode in result.modes) > _LOST * len(result.modes)
     nowhere = any(finding.code == "map.unused" for finding in result.findings)  # poses are not in the map's frame
-    if nowhere or config.estimator.initial_pose is not None or (lost and not at_origin):
+    if nowhere or config.estimator.initial_pose is not None or ((lost or unsure) and not (at_origin or placed)):
         return None
     times = (matched.stamps_ns - matched.stamps_ns[0]) * 1e-9
     sentence = truth_sentence(config, np.column_stack([times, matched.truth]), times, matched.estimate)
@@ -312,6 +317,7 @@ def _turned(config: Config, matched: Matched) -> Finding | None:
 
 
 _LOST = 0.1  # share of the poses
+_ELSEWHERE_SIGMAS = 10.0  # of its position, beyond which a run on a map is no wrong place
 _TURNED_RAD = 0.1  # yaw of a truth that is worth a word
 _AGREE = 0.25  # largest error of positions over the path's extent, and spread of the yaw over what it is off by
 

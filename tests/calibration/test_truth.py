@@ -184,6 +184,7 @@ def test_training_follows_where_it_accepts_the_recordings(tmp_path, commanded, f
     assert done.exit_code == 0, done.output
     assert ("next: fgloc train --init" in done.output) == follows
     assert "next: fgloc smooth" in done.output
+    assert ("note: the noise" in done.output) == (len(bags) == 1)  # one drive does not tell it from drive to drive
 
 
 def test_wheels_that_do_not_follow_the_truth_are_named(tmp_path):
