@@ -11,7 +11,7 @@ import numpy as np
 
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.handling import Span, cut, handling, outside
-from fgloc.diagnosis.landmarks import distances_agree
+from fgloc.diagnosis.landmarks import by_landmarks, distances_agree
 from fgloc.diagnosis.pairs import RATE_SCALE, ROUGHLY, TELLS, Figure, RateFit
 from fgloc.diagnosis.signals import Path
 from fgloc.frames import homogeneous, rotation_of, sensor_pose
@@ -85,14 +85,14 @@ def check_wheels(found: Conventions, path: Path) -> Path:
     if fit.scale.value <= 0.0:
         return path
     off_by = found.wheels_off_by(path, 1.0 / fit.scale.value)
-    other = None if off_by is None else found.path_with(found.wheel_lines(off_by[0]))
-    if off_by is None or other is None:
+    if off_by is None:
         return path
     factor, code, clause = off_by
-    seen = found.signals.sightings()
-    agree = None if seen is None else distances_agree(found, other, seen)
-    if agree is False or (agree is None and code != "wheels.unit"):
-        return path
+    other, seen = found.path_with(found.wheel_lines(factor)), found.signals.sightings()
+    agree = None if other is None or seen is None else distances_agree(found, other, seen)
+    if other is None or agree is False or (agree is None and code != "wheels.unit"):
+        # it is the track or the gyro, beside whatever the wheels are off by
+        return path if seen is None else by_landmarks(found, path, seen)
     also = ", and by the landmarks they move as much too far" if agree else ""
     text = f"The wheels turn {fit.scale.value:.3g} ± {fit.scale.sigma:.2g} times as much as the gyro{also}: {clause}"
     share = Figure(1.0 / fit.scale.value, fit.scale.sigma / fit.scale.value**2)

@@ -119,7 +119,8 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
             path, fits = without
     best = _best(fits)
     reach = _reach(as_given, best)
-    if path.source == "ticks" and best.misfit < _FITS * reach and best.turns.off(1.0, 1.0 - math.exp(-GEAR)):
+    off = path.source == "ticks" and best.turns.off(1.0, 1.0 - math.exp(-GEAR))
+    if off and best.misfit < _FITS * reach and "wheels.turn" not in found.codes:  # the gyro's is nearer
         scale_omega = round(found.config.wheels.scale_omega * best.turns.value, 4)
         text = (
             f"By the landmarks the robot turns {best.turns.value:.3g} ± {best.turns.sigma:.2g} times as much as its "
@@ -193,6 +194,14 @@ def distances_agree(found: Conventions, path: Path, seen: Sightings) -> bool | N
     as_given, _ = as_configured(found, seen)
     best = _fitting(fit_sightings(path, as_given), as_given)
     return None if best is None or best.scale.sigma > 0.3 * best.scale.value else _unscaled(best)
+
+
+def by_landmarks(found: Conventions, path: Path, seen: Sightings) -> Path:
+    """Name wheels that way and turn by the landmarks show to be off alike; the path without that."""
+    as_given, _ = as_configured(found, seen)
+    fits = fit_sightings(path, as_given)
+    without = _wheels_off(found, path, as_given, fits) if fits else None
+    return path if without is None else without[0]
 
 
 def _fitting(fits: Mapping[str, Mounting], seen: Sightings) -> Mounting | None:

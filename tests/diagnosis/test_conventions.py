@@ -284,6 +284,13 @@ def test_a_side_that_counts_backwards_before_a_gear_has_one_line_for_each_radius
     assert radii == pytest.approx([-RADIUS / 3.0, RADIUS / 3.0], rel=0.01)
 
 
+def test_a_gear_and_a_gyro_in_degrees_are_told_apart_by_the_landmarks(tmp_path):
+    bag = record(tmp_path, Broken(joint_angle=3.0, imu_unit=180.0 / math.pi))
+    config = config_of({"recording": {"topics": {"truth": "none"}}, "wheels": GEOMETRY})
+    found = [f.code for f in conventions_of(bag, config) if f.code.split(".")[0] in COMPARED]
+    assert found == ["wheels.gear", "imu.unit"]
+
+
 def test_a_wrong_track_is_named_by_landmarks_alone(tmp_path):
     bag = record(tmp_path, Broken(joint_angle=1.0))
     topics = {"imu": "none", "truth": "none"}
