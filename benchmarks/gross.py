@@ -201,7 +201,7 @@ def _swap_joints(robot: Settings, start: tuple[float, float, float]) -> None:
 
 
 def _left_backwards(robot: Settings, start: tuple[float, float, float]) -> None:
-    """Of a robot that publishes neither an odometry nor a gyro: images alone tell it."""
+    """Reverse one side of a robot that publishes neither an odometry nor a gyro: images alone tell it."""
     robot["wheels"]["left_radius"] *= -1.0
     robot.setdefault("recording", {}).setdefault("topics", {}).update({"odometry": "none", "imu": "none"})
 

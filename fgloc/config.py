@@ -74,7 +74,9 @@ class WheelsConfig(Section):
     left_radius: float | None = Field(
         None, ge=-2.0, le=2.0, description="way per unit of the angle, usually rad; negative: it counts backwards"
     )
-    right_radius: float | None = Field(None, ge=-2.0, le=2.0, description="likewise")
+    right_radius: float | None = Field(
+        None, ge=-2.0, le=2.0, description="way per unit of the angle, usually rad; negative: it counts backwards"
+    )
     track: float | None = Field(None, ge=1e-3, le=5.0, description="between the contact points")
     angle_range: float | None = expert(None, ge=1e-3, le=1e9, description="where the angle rolls over")
     drive: AnyDrive | None = Field(None, description="another drive (docs/drives.md)")

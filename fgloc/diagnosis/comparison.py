@@ -25,7 +25,6 @@ _UNIT = 0.04  # logarithm by which a scale may miss a unit's
 _WHEEL_UNITS = {math.pi / 180.0: "degrees", math.tau: "revolutions"}
 _RATE_UNITS = _WHEEL_UNITS | {math.tau / 60.0: "revolutions per minute"}  # no angle is in the last
 _BEYOND = 0.005  # share of rates beyond a bound, which is of another unit then
-_GEAR = 0.4  # logarithm from which way and turn that are off alike are a gear's, and no radius that was measured badly
 GEAR = 0.25  # logarithm from which way and turn that are off alike are no radii that were measured badly
 _WHEEL_UNIT = 0.2  # logarithm by which wheels may be off besides: radii and a track that nobody has measured
 

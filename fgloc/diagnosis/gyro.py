@@ -73,8 +73,9 @@ def by_hand(found: Conventions, path: Path) -> Path:
 
 
 def check_wheels(found: Conventions, path: Path) -> Path:
-    """Name wheels in another unit, before a gear or of other radii, by the gyro's turn; the path with that undone.
+    """Name wheels that count backwards, in another unit, before a gear or of other radii; the path with that undone.
 
+    The gyro's turn is what they are held against.
     A unit is one unless sightings refute it; anything else may be the track alone, unless sightings confirm it.
     """
     if found.signals.rates() is None:

@@ -587,7 +587,7 @@ def test_a_truth_in_another_frame_is_named_and_blames_no_covariance(tmp_path):
 
 
 def test_a_map_in_another_frame_than_the_truth_is_named_and_blames_no_covariance(tmp_path):
-    """As of a map that `fgloc map` made of another drive: its frame is that of the drive's first pose."""
+    """A map that `fgloc map` made of another drive has the frame of that drive's first pose."""
     bag = write_circle(tmp_path, seconds=15.0)
     given = load_map(tmp_path / "map.yaml")
     moved = {i: replace(lm, position=lm.position + np.array([3.0, -2.0, 0.0])) for i, lm in given.landmarks.items()}
