@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
@@ -476,8 +476,22 @@ def _flags(result: RunData, decisions: Sequence[Decision]) -> dict[str, FloatArr
 def _activity(axes: Axes, span: float, title: str, rows: Mapping[str, FloatArray], color: str, bridge: bool) -> None:
     """Draw one row for each name: bars where items came at a steady rate (`bridge`), else a tick each."""
     for row, times in enumerate(rows.values()):
-        axes.broken_barh(_bars(np.unique(times), span, bridge), (row - 0.3, 0.6), facecolors=color, linewidth=0)
+        _boxes(axes, *_bars(np.unique(times), span, bridge), row - 0.3, row + 0.3, color)
     _rows(axes, title, list(rows))
+
+
+def _boxes(
+    axes: Axes,
+    starts: FloatArray,
+    ends: FloatArray,
+    low: FloatArray | float,
+    high: FloatArray | float,
+    colors: Sequence[str] | str,
+) -> None:
+    """Draw filled boxes as one collection: one patch for each keyframe would take seconds."""
+    x0, x1, y0, y1 = np.broadcast_arrays(starts, ends, low, high)
+    corners = np.stack([np.stack([x0, x0, x1, x1], axis=1), np.stack([y0, y1, y1, y0], axis=1)], axis=2)
+    axes.add_collection(PolyCollection(corners, facecolors=colors, linewidths=0))
 
 
 def _rows(axes: Axes, title: str, names: Sequence[str]) -> None:
@@ -496,14 +510,14 @@ def _title(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left", fontsize=NORMAL, pad=2.5)
 
 
-def _bars(times: FloatArray, span: float, bridge: bool) -> list[tuple[float, float]]:
-    """Start and width of the stretches without a silence; a lone item is wide enough to be seen."""
+def _bars(times: FloatArray, span: float, bridge: bool) -> tuple[FloatArray, FloatArray]:
+    """Starts and ends of the stretches without a silence; a lone item is wide enough to be seen."""
     if len(times) == 0:
-        return []
+        return times, times
     steps = np.diff(times)
     silence = min(3.0 * float(np.median(steps)), GAP_S) if bridge and len(steps) else 0.0
-    cuts = np.flatnonzero(steps > max(silence, span / 600.0)) + 1
-    return [(float(part[0]), float(np.ptp(part)) + span / 600.0) for part in np.split(times, cuts)]
+    cuts = np.flatnonzero(steps > max(silence, span / 600.0))
+    return times[np.append(0, cuts + 1)], times[np.append(cuts, len(times) - 1)] + span / 600.0
 
 
 def _weights(axes: Axes, result: RunData, decisions: Sequence[Decision]) -> None:
@@ -521,7 +535,7 @@ def _weights(axes: Axes, result: RunData, decisions: Sequence[Decision]) -> None
         weights = np.array([d.weight for d in held])
         heights = np.where(weights > 0.0, np.clip(weights, 0.06, 1.0), 1.0) * 0.7
         colors = [BLUE if w > _FULL else ORANGE if w > 0.0 else RED for w in weights]
-        axes.bar(starts, heights, ends - starts, row + 0.35 - heights, align="edge", color=colors, linewidth=0)
+        _boxes(axes, starts, ends, row + 0.35 - heights, row + 0.35, colors)
         for level, text in ((-0.35, "1"), (0.0, "½"), (0.35, "0")):
             axes.axhline(row + level, color=GREY, lw=0.4, linestyle=":", zorder=0.5)
             at: dict[str, Any] = dict(xy=(1.0, row + level), xycoords=("axes fraction", "data"), xytext=(2, 0))
@@ -550,7 +564,7 @@ def _landmarks(axes: Axes, result: RunData, span: float, decisions: Sequence[Dec
         for accepted, color in ((True, BLUE), (False, RED)):
             stamps = [d.stamp_ns for d in decisions if _row_of(d) == what and (d.weight > 0.0) == accepted]
             bars = _bars(np.unique(seconds(result, stamps)), span, bridge=False)
-            axes.broken_barh(bars, (row - 0.35, 0.7), color=color, lw=0)
+            _boxes(axes, *bars, row - 0.35, row + 0.35, color)
     _rows(axes, _LANDMARKS, [kind or str(i) for i, kind in shown])
 
 

@@ -48,6 +48,9 @@ _FILES: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "fgloc", "pdf.
 def image_of(figure: Figure, form: Format) -> bytes:
     """A figure as a file, the same bytes for the same figure."""
     buffer = io.BytesIO()
+    if (layout := figure.get_layout_engine()) is not None:  # once: `savefig` would draw all of it once more for that
+        layout.execute(figure)
+        figure.set_layout_engine("none")
     with rc_context(_FILES):
         figure.savefig(buffer, format=form, metadata=_UNDATED[form])
     return buffer.getvalue()

@@ -81,6 +81,11 @@ def streams_of(role: str) -> tuple[Stream, ...]:
 
 def converters(role: str) -> Mapping[str, Converter]:
     """Converters of a role, by message type; empty if no sensor has it."""
+    return _converters(role, outside_sensors())
+
+
+@cache  # asked for every message
+def _converters(role: str, outside: tuple[type[Sensor], ...]) -> Mapping[str, Converter]:
     return {kind: converter for stream in streams_of(role) for kind, converter in stream.converters.items()}
 
 
