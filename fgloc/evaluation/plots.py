@@ -491,7 +491,7 @@ def _boxes(
     """Draw filled boxes as one collection: one patch for each keyframe would take seconds."""
     x0, x1, y0, y1 = np.broadcast_arrays(starts, ends, low, high)
     corners = np.stack([np.stack([x0, x0, x1, x1], axis=1), np.stack([y0, y1, y1, y0], axis=1)], axis=2)
-    axes.add_collection(PolyCollection(corners, facecolors=colors, linewidths=0))
+    axes.add_collection(PolyCollection(list(corners), facecolors=colors, linewidths=0))
 
 
 def _rows(axes: Axes, title: str, names: Sequence[str]) -> None:

@@ -18,6 +18,7 @@ from fgloc.errors import RecordingError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.reader import CONVERTERS, HEADERLESS, TF_TYPES, Recording, TopicInfo, converters_of
+from fgloc.recording.transforms import TF_TOPIC, pair_topic
 from fgloc.sensors import registry
 from fgloc.sensors.checks import (
     Collector,
@@ -389,6 +390,9 @@ def _roles(
         told = "sightings alone tell" if {"image", "sightings"} & base_roles(roles) else "nothing measures"
         text = f"No odometry, joint states or commands: {told} how the robot moves."
         yield Finding(motion, text + _perhaps_odometry(recording), Severity.WARNING)
+    elif not unsettled and not {"odometry", "joints"} & roles.keys() and (pairs := _of_odometry(recording)):
+        text = f"Commands alone tell how the robot moves. If {' or '.join(pairs)} is an odometry of the robot, "
+        yield Finding("recording.unused", text + f"set recording.topics.odometry: {pairs[0]}.", Severity.NOTE)
     if not unsettled and not placing_roles(roles, config):
         text = "No images and no marker sightings: nothing bounds the drift." + _perhaps_sightings(recording)
         yield Finding(place, text, Severity.WARNING)
@@ -418,12 +422,15 @@ def _perhaps_odometry(recording: Recording) -> str:
         for topic in recording.topics
         if topic.role is None and topic.count and topic.message_type in converters_of("odometry")
     ]
-    frames = [name for name in recording.frames.frames if "odom" in name.lower()]
-    if not fitting and frames:
-        return f" tf has the frame {frames[0]}, and poses in tf are not read: record the topic of the odometry."
+    fitting += _of_odometry(recording)
     if not fitting:
         return ""
     return f" If {' or '.join(fitting)} is an odometry of the robot, set recording.topics.odometry: {fitting[0]}."
+
+
+def _of_odometry(recording: Recording) -> list[str]:
+    """Poses in tf that may be those of an odometry, in place of topics."""
+    return [pair_topic(*pair) for pair in recording.frames.moving if "odom" in pair[0].lower()]
 
 
 _OF_MARKERS = re.compile(r"(?<![a-z])(aruco|april_?tag|tag|fiducial|marker)s?(?![a-z])", re.IGNORECASE)
@@ -535,10 +542,10 @@ def _base_names(config: Config, child_frame_id: str) -> tuple[str, ...]:
 def format_info(info: RecordingInfo) -> str:
     """The report as text."""
     start = datetime.fromtimestamp(info.start_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    messages = sum(topic.count for topic in info.topics)
+    counts = [topic.count for topic in info.topics if not topic.name.startswith(TF_TOPIC)]
     head = (
         f"{info.path}\n{_KINDS[info.kind]}, {info.duration_s:.1f} s from {start}, {info.size_bytes / 1e6:.1f} MB, "
-        f"{messages} messages on {plural(len(info.topics), 'topic')}"
+        f"{sum(counts)} messages on {plural(len(counts), 'topic')}"
     )
     rows = [("topic", "type", "count", "rate", "longest gap", "delay", "used as")]
     rows += [

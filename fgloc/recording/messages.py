@@ -255,6 +255,7 @@ class Decoder:
             self.store.register(_needed(used, {}, ros1))
             damaged |= embedded.keys() & used
         self._deserialize = self.store.deserialize_ros1 if ros1 else self.store.deserialize_cdr
+        self._serialize = self.store.serialize_ros1 if ros1 else self.store.serialize_cdr
         self.notes: list[str] = []
         name = "ROS 1 Noetic" if ros1 else "ROS 2 Humble"
         if missing:
@@ -267,6 +268,10 @@ class Decoder:
     def deserialize(self, message_type: str, raw: bytes) -> Any:
         """Deserialize. Raises whatever rosbags leaks on damaged bytes."""
         return self._deserialize(raw, message_type)
+
+    def serialize(self, message_type: str, content: Any) -> bytes:
+        """Serialize what `deserialize` gave, or a part of it."""
+        return bytes(self._serialize(content, message_type))
 
 
 @cache

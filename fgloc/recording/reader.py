@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -28,7 +29,7 @@ from fgloc.errors import RecordingError
 from fgloc.recording.fields import JointFields, numeric_fields
 from fgloc.recording.messages import Decoder
 from fgloc.recording.storage import RawMessage, Storage, lost
-from fgloc.recording.transforms import FrameTree
+from fgloc.recording.transforms import TF_TOPIC, FrameTree, is_odometry_pair, pair_topic
 from fgloc.sensors import registry
 from fgloc.sensors.base import Converter, When, matrix, nanoseconds, vector, xyz, xyzw
 from fgloc.types import CameraInfoEvent, Event, TransformEvent, TruthEvent
@@ -126,6 +127,7 @@ def _planar_truth(m: Any, when: When) -> Event:
 
 _ODOMETRY, _TWIST = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistWithCovarianceStamped"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"  # as Vicon's bridge publishes poses
+_MOST_OF_TF = 2000  # messages from the beginning, to see which frames move
 POINT = "geometry_msgs/msg/PointStamped"  # a total station's, without a yaw; or a click on a map
 CONVERTERS: dict[Role, dict[str, Converter]] = {
     "camera_info": {"sensor_msgs/msg/CameraInfo": _camera_info},
@@ -345,7 +347,8 @@ def _fits(role: Role, topic: TopicInfo) -> bool:
         other = topic.message_type in (_TRANSFORM, POINT, _ODOMETRY)
         return _says_truth(topic.name) or not (other or _NOT_TRUTH.search(topic.name))
     if role == "odometry":  # other poses and twists may be anything: the configuration has to name them
-        return topic.message_type in (_ODOMETRY, _TWIST) and not _says_truth(topic.name)
+        of_odometry = topic.message_type in (_ODOMETRY, _TWIST) or topic.name.startswith(TF_TOPIC)
+        return of_odometry and not _says_truth(topic.name)
     if role in ("image", "camera_info"):
         return not is_derived(topic.name)
     return True
@@ -454,6 +457,16 @@ class Recording:
         for channel in sorted(channels, key=lambda c: (c.topic, -c.count)):
             known = found.setdefault(channel.topic, TopicInfo(channel.topic, channel.message_type, 0))
             found[channel.topic] = replace(known, count=known.count + channel.count)
+        known_types = TF_TYPES.union(*map(converters_of, role_names()))
+        known_types |= {t.message_type for t in found.values() if t.name in config.topics.of_joints}
+        self._decoder = Decoder(
+            self.kind == "ros1",
+            [(c.message_type, c.definition) for c in channels if c.message_type in known_types and c.count],
+        )
+        self._tf_topics = {t.name for t in found.values() if t.message_type in TF_TYPES and t.count}
+        pairs, of_pairs = self._pairs(tuple(found.values()))
+        self._in_tf = frozenset(pairs)
+        found |= pairs
         selection = select_roles(tuple(found.values()), config.topics, config.beside)
         self.roles: Mapping[Role, str] = selection.roles
         self.problems = selection.problems
@@ -462,13 +475,7 @@ class Recording:
             **dict.fromkeys(config.topics.of_joints, "joints"),
         }
         self.topics = tuple(replace(topic, role=self.role_of.get(topic.name)) for topic in found.values())
-        known_types = TF_TYPES.union(*map(converters_of, role_names()))
-        known_types |= {t.message_type for t in self.topics if t.name in config.topics.of_joints}
-        self._decoder = Decoder(
-            self.kind == "ros1",
-            [(c.message_type, c.definition) for c in channels if c.message_type in known_types and c.count],
-        )
-        self._notes = (*selection.notes, *self._decoder.notes)
+        self._notes = (*of_pairs, *selection.notes, *self._decoder.notes)
         self.undecodable: dict[str, int] = {}
         self._events = MessageEvents(config)
         self.problems = (*self.problems, *self._lacking_fields())
@@ -512,8 +519,7 @@ class Recording:
     @cached_property
     def frames(self) -> FrameTree:
         """All transforms of ``/tf_static`` and ``/tf``; the first use reads these topics through."""
-        topics = {topic.name for topic in self.topics if topic.message_type in TF_TYPES and topic.count}
-        messages = self._storage.messages(topics) if topics else iter(())
+        messages = self._storage.messages(self._tf_topics) if self._tf_topics else iter(())
         events = (event for message in messages for event in self.decode(message, None))
         return FrameTree(event for event in events if isinstance(event, TransformEvent))
 
@@ -525,12 +531,60 @@ class Recording:
         """
         self.undecodable = {}
         role_of = {topic.name: topic.role for topic in self.topics if topic.role or topic.message_type in TF_TYPES}
-        for message in self._storage.messages(role_of.keys()):
+        for message in self.messages(role_of.keys()):
             yield from self.decode(message, role_of[message[0]])
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Messages of these topics (None: of all), serialized, in order of receive time."""
-        return self._storage.messages(topics)
+        """Messages of these topics (None: of all), serialized, in order of receive time; also of pairs in tf."""
+        pairs = self._in_tf if topics is None else self._in_tf & set(topics)
+        if not pairs:
+            return self._storage.messages(topics)
+        return self._with_pairs(topics, pairs)
+
+    def _with_pairs(self, topics: Collection[str] | None, pairs: Collection[str]) -> Iterator[RawMessage]:
+        wanted = None if topics is None else {*topics, *self._tf_topics} - self._in_tf
+        for message in self._storage.messages(wanted):
+            if topics is None or message[0] in topics:
+                yield message
+            for name, transform in self._split(message):
+                if name in pairs:
+                    yield name, _TRANSFORM, message[2], self._decoder.serialize(_TRANSFORM, transform)
+
+    def _split(self, message: RawMessage) -> list[tuple[str, Any]]:
+        """Transforms of a message of tf by the names of their pairs; empty if it is of another topic, or damaged."""
+        topic, message_type, _, raw = message
+        try:
+            content = self._decoder.deserialize(message_type, raw) if topic in self._tf_topics else None
+        except Exception:  # rosbags leaks struct and decoding errors on damaged bytes
+            return []
+        listed = [] if content is None else content.transforms
+        return [(pair_topic(t.header.frame_id, t.child_frame_id), t) for t in listed]
+
+    def _pairs(self, topics: Sequence[TopicInfo]) -> tuple[dict[str, TopicInfo], list[str]]:
+        """Poses in tf that are read as topics: those that the configuration names, else an odometry that is only there.
+
+        Returns:
+            A topic for each, with the messages counted in the beginning of tf, and notes on what was taken so.
+        """
+        of_role = {role: self.config.topics.given(role) for role in role_names()} | dict(self.config.beside)
+        named = {given for given in of_role.values() if given is not None and given.startswith(TF_TOPIC)}
+        alone = of_role["odometry"] is None and not any(t.count and _fits("odometry", t) for t in topics)
+        if not self._tf_topics or not (named or alone):
+            return {}, []
+        counts: dict[str, int] = {}
+        for message in islice(self._storage.messages(self._tf_topics), _MOST_OF_TF):
+            for name, _ in self._split(message):
+                counts[name] = counts.get(name, 0) + 1
+        fitting = [name for name, n in counts.items() if n > 1 and is_odometry_pair(name, self.config.base_frame)]
+        notes = []
+        if alone and len(fitting) == 1:
+            named |= set(fitting)
+            notes = [f"{fitting[0]} is taken as odometry: no topic holds one."]
+        elif alone and fitting:
+            notes = [
+                f"No odometry: {', '.join(fitting)} could be it; choose one with recording.topics.odometry, or none."
+            ]
+        return {name: TopicInfo(name, _TRANSFORM, counts[name]) for name in named & counts.keys()}, notes
 
     def _lacking_fields(self) -> Iterator[str]:
         """Sentences on joints whose field the topic's messages do not have."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgloc.errors import RecordingError
-from fgloc.frames import quaternion_matrix, transform_matrix
+from fgloc.frames import BASE_NAMES, quaternion_matrix, transform_matrix
 from fgloc.types import FloatArray, TransformEvent
 
 _SAME_M = 1e-3
@@ -52,6 +52,11 @@ class FrameTree:
     def frames(self) -> tuple[str, ...]:
         """Names of all frames, sorted."""
         return tuple(sorted({name for edge in self._edges for name in edge}))
+
+    @property
+    def moving(self) -> tuple[tuple[str, str], ...]:
+        """Parent and child of each transform that changes, sorted."""
+        return tuple(sorted(pair for pair, edge in self._edges.items() if edge.moves))
 
     def __contains__(self, frame: str) -> bool:
         return _bare(frame) in self.frames
@@ -117,6 +122,22 @@ class FrameTree:
 def _bare(frame: str) -> str:
     """ROS 1 wrote frames with a leading slash."""
     return frame.lstrip("/")
+
+
+TF_TOPIC = "tf:"
+"""Beginning of the name that the pose of one frame in another has in place of a topic: ``tf:odom>base_link``."""
+
+
+def pair_topic(parent: str, child: str) -> str:
+    """Name of the pose of frame ``child`` in frame ``parent`` in tf, in place of a topic."""
+    return f"{TF_TOPIC}{_bare(parent)}>{_bare(child)}"
+
+
+def is_odometry_pair(topic: str, base_frame: str | None) -> bool:
+    """Whether a pair's frames are those of an odometry; ``base_frame``: the robot's, None: one of the usual names."""
+    parent, _, child = topic.removeprefix(TF_TOPIC).partition(">")
+    bases = BASE_NAMES if base_frame is None else (_bare(base_frame),)
+    return parent.rpartition("/")[2] == "odom" and (child in bases or child.rpartition("/")[2] in bases)
 
 
 def _differ(T: FloatArray, translation: FloatArray, rotation: FloatArray) -> bool:

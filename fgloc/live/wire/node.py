@@ -23,6 +23,7 @@ from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, 
 from fgloc.live.wire.transport import Clock, Publication, Received, Transport
 from fgloc.recording.reader import TF_TYPES, MessageEvents, TopicInfo, select_roles, topic_key
 from fgloc.recording.standard_messages import MAP_FRAME
+from fgloc.recording.transforms import TF_TOPIC
 from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Severity
 
 # --- Intake: topics found by type, selected by role, decoded as those of a recording ----------------------------------
@@ -125,7 +126,8 @@ class Intake:
         for role in every:
             given = self._config.topics.given(role)
             if given not in (None, "none") and given not in names:
-                lacking.append(f"{given} ({topic_key(role)})")
+                why = ", which is read from recordings only: give a topic" if given.startswith(TF_TOPIC) else ""
+                lacking.append(f"{given} ({topic_key(role)}{why})")
         lacking += [f"{topic} (recording.joints)" for topic in self._config.topics.of_joints[1:] if topic not in names]
         there = ", ".join(f"{p.topic} ({p.message_type})" for p in self._found) or "none"
         return f"Waiting for {' and '.join(lacking)}; topics there: {there}." if lacking else ""

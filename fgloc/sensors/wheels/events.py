@@ -97,6 +97,11 @@ def odometry_converters(kind: type[PoseAndTwistEvent]) -> dict[str, Converter]:
         known = xyz(pose.position), xyzw(pose.orientation), covariance
         return kind(*when, m.header.frame_id, "", *known, np.full(3, np.nan), np.full(3, np.nan), NOT_GIVEN)
 
+    def transform(m: Any, when: When) -> Event:
+        known = xyz(m.transform.translation), xyzw(m.transform.rotation), none
+        frames = m.header.frame_id, m.child_frame_id
+        return kind(*when, *frames, *known, np.full(3, np.nan), np.full(3, np.nan), NOT_GIVEN)
+
     none = np.zeros((6, 6))
     return {
         "nav_msgs/msg/Odometry": whole,
@@ -108,6 +113,7 @@ def odometry_converters(kind: type[PoseAndTwistEvent]) -> dict[str, Converter]:
             m, m.pose.pose, matrix(m.pose.covariance, 6), when
         ),
         "geometry_msgs/msg/PoseStamped": lambda m, when: pose_only(m, m.pose, none, when),
+        "geometry_msgs/msg/TransformStamped": transform,
     }
 
 
