@@ -232,10 +232,9 @@ def test_timeline_draws_each_source_at_its_weight_as_last_judged():
     figure = plot_timeline(replace(base, decisions=(*base.decisions, *gyro, *taken_back)))
     axes = panel(figure, "weight")
     assert names(axes) == ["wheels (310)", "gyro (300)"]
-    wheels, inflated = axes.patches[:300], axes.patches[300:]
-    off = [i for i, bar in enumerate(wheels) if bar.get_facecolor() == to_rgba(style.RED)]
-    assert off == list(range(50, 60))
-    heights = np.array([bar.get_height() for bar in inflated])
+    wheels, inflated = axes.collections[:2]
+    assert np.flatnonzero((wheels.get_facecolor() == to_rgba(style.RED)).all(axis=1)).tolist() == list(range(50, 60))
+    heights = np.array([np.ptp(box.vertices[:, 1]) for box in inflated.get_paths()])
     np.testing.assert_allclose(heights[:100] / heights[100:200], 0.25)
     assert "wheels: slip (10)" in names(panel(figure, "reasons"))
 
