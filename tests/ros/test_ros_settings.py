@@ -75,6 +75,15 @@ def test_topics_by_parameter_remapping_and_file_in_this_order(tmp_path):
     assert topics.sightings is None
 
 
+def test_a_pose_in_tf_stands_for_a_topic_in_recordings_only(tmp_path):
+    file = tmp_path / "robot.yaml"
+    file.write_text("recording:\n  topics: {odometry: 'tf:odom>base_link', truth: 'tf:mocap>robot'}\n")
+    with pytest.raises(ConfigError, match=r"recording\.topics\.odometry: tf:odom>base_link"):
+        read("/one", config=str(file))
+    topics = read("/one", config=str(file), **{"topics.odometry": "/odom"}).config.recording.topics
+    assert (topics.odometry, topics.truth) == ("/odom", "none")
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

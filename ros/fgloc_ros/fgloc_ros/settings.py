@@ -11,6 +11,7 @@ from typing import Any
 from fgloc.config import Config, load_config, role_names
 from fgloc.errors import ConfigError
 from fgloc.live.wire.node import RATE_HZ, Publishing
+from fgloc.recording.transforms import TF_TOPIC
 from fgloc.sensors.maps import configured_map
 from fgloc.types import LandmarkMap
 
@@ -101,6 +102,13 @@ def _with_topics(
             topics[role] = resolve(given)
         elif to := remapped(role):
             topics[role] = to
+        elif by_file is not None and by_file.startswith(TF_TOPIC):
+            if role != "truth":
+                raise ConfigError(
+                    f"recording.topics.{role}: {by_file} is read from recordings only, expected a topic: give the "
+                    f"parameter topics.{role}"
+                )
+            topics[role] = "none"
         elif by_file is not None:
             topics[role] = resolve(by_file.lstrip("/"))
     return _changed(config, "recording", topics=config.recording.topics.model_copy(update=topics))
