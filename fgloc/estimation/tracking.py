@@ -151,7 +151,7 @@ class Tracking:
         Returns:
             The probability, and the covariance ``(3, 3)`` of the pose's error if it holds.
         """
-        if contradicting == 0 or not self._known or self._given or len(self._places) == 0:
+        if contradicting == 0 or not self._known or len(self._places) == 0:
             return 0.0, np.zeros((3, 3))
         return CARRIED / (CARRIED + WRONG_LANDMARK**contradicting), self._spread_of_map(belief)
 

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import ValidationError
 
-from fgloc.config import Config, Role, known_role
+from fgloc.config import Config, EstimatorConfig, Role, known_role
 from fgloc.errors import ConfigError, EstimatorError, FglocError
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.intake.clocks import Source, TopicClocks, source_of
@@ -81,7 +82,7 @@ def _numbers(name: str, value: Any, where: str) -> FloatArray:
     except (TypeError, ValueError):
         array = np.empty((0,) * (len(shape) + 1))
     fits = len(array.shape) == len(shape) and all(s is None or n == s for n, s in zip(array.shape, shape, strict=True))
-    if not fits:
+    if not fits and not (array.shape == (0,) and shape[:1] == (None,)):
         size = " x ".join("n" if n is None else str(n) for n in shape) or "1"
         numbers = "1 number" if size == "1" else f"{size} numbers"
         raise EstimatorError(f"{where}: {name} is {reprlib.repr(value)}; expected {numbers}: {meaning}")
@@ -96,9 +97,7 @@ def _wrong_argument(method: Callable[..., Any], given: Mapping[str, Any]) -> Non
         if name == "markers" and isinstance(value, Mapping):
             for corners in value.values():
                 _numbers(name, corners, method.__name__)
-        elif name == "image":
-            raise EstimatorError(f"{method.__name__}: image is {reprlib.repr(value)}; expected {_SHAPES[name][1]}")
-        else:
+        elif name != "image":
             _numbers(name, value, method.__name__)
 
 
@@ -108,14 +107,14 @@ def _explained(method: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(method)
     def called(self: Live, *args: Any, **kwargs: Any) -> Any:
+        given = signature.bind(self, *args, **kwargs).arguments
+        _wrong_argument(method, given)
         try:
             return method(self, *args, **kwargs)
         except (AttributeError, IndexError, TypeError, ValueError) as error:
-            try:
-                given = signature.bind(self, *args, **kwargs).arguments
-            except TypeError:
-                raise error from None  # of a call that Python itself refuses
-            _wrong_argument(method, given)
+            if "image" in given:
+                image = reprlib.repr(given["image"])
+                raise EstimatorError(f"{method.__name__}: image is {image}; expected {_SHAPES['image'][1]}") from error
             raise EstimatorError(
                 f"{method.__name__}: {error}; expected values as help(fgloc.Live.{method.__name__}) has them"
             ) from error
@@ -267,6 +266,40 @@ class Reception:
         return (*self._notes, *self._clocks.notes, *gaps)
 
 
+TYPED_SIGMAS = (0.5, 0.5, 0.26)
+"""Standard deviations [m, m, rad] of a pose that a person gives without any, as RViz has it for a click on the map."""
+
+
+def begun_at(config: Config, pose: Sequence[float], where: str) -> Config:
+    """Configuration of a run that begins at a pose that a person typed.
+
+    Args:
+        config: keeps its ``initial_sigmas`` if it gives some.
+        pose: x, y [m] and yaw [rad] in the map.
+        where: name of the option, for errors.
+
+    Raises:
+        ConfigError: no such pose.
+    """
+    as_given = config.estimator.model_dump()
+    if "initial_sigmas" not in config.estimator.model_fields_set:
+        as_given["initial_sigmas"] = TYPED_SIGMAS
+    try:
+        estimator = EstimatorConfig.model_validate(as_given | {"initial_pose": tuple(pose)})
+    except ValidationError as error:
+        why = "; ".join(dict.fromkeys(e["msg"] for e in error.errors()))
+        raise ConfigError(
+            f"{where} {', '.join(f'{value:g}' for value in pose)}: {why}; expected x, y [m] and yaw [rad]"
+        ) from None
+    return config.model_copy(update={"estimator": estimator})
+
+
+def _of_type(name: str, value: Any, kinds: type | tuple[type, ...], expected: str) -> None:
+    """Raise the error that names an argument of another type."""
+    if not isinstance(value, kinds):
+        raise ConfigError(f"Live: {name} is {reprlib.repr(value)}; expected {expected}")
+
+
 class Live(registry.SensorInput):
     """Localizes a robot while it drives.
 
@@ -309,9 +342,14 @@ class Live(registry.SensorInput):
                 and the caller's own threads never wait for an update. It costs some processor time for every event.
 
         Raises:
-            ConfigError: a role that there is not.
+            ConfigError: an argument of another type, or a role that there is not.
             MapError, ModelError: as their loaders have it.
         """
+        _of_type("config", config, Config, "a Config, such as load_config(Path('robot.yaml'))")
+        _of_type("landmark_map", landmark_map, (LandmarkMap, Path, type(None)), "a LandmarkMap, or a Path")
+        _of_type("state", state, (Path, type(None)), "a Path")
+        if isinstance(roles, str):
+            raise ConfigError(f"Live: roles is {roles!r}; expected several, such as [{roles!r}]")
         for role in roles or ():
             try:
                 known_role(role)
@@ -367,7 +405,7 @@ class Live(registry.SensorInput):
             self._estimation.put(used)
         return tuple(used)
 
-    def reset_pose(self, pose: Sequence[float], sigmas: Sequence[float] = (0.5, 0.5, 0.26)) -> None:
+    def reset_pose(self, pose: Sequence[float], sigmas: Sequence[float] = TYPED_SIGMAS) -> None:
         """Go on from a given pose: x, y [m], yaw [rad] in the map, and their sigmas.
 
         Sightings that contradict it win: the robot is then found again on the map.

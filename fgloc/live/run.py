@@ -37,6 +37,7 @@ from fgloc.live.state import (
 from fgloc.recording.transforms import FrameTree
 from fgloc.sensor_setup import base_frame, camera_frame, given_pose
 from fgloc.sensors import registry
+from fgloc.sensors.base import with_values
 from fgloc.types import (
     Camera,
     CameraInfoEvent,
@@ -301,11 +302,14 @@ class OnlineRun:
         self.newest: Estimate | None = None
         self.keyframes = 0
         self.reordering_s = 0.0
-        self._config = config
+        # A first pose is taken as one that is given while the robot drives: sightings that contradict it win
+        first, sigmas = config.estimator.initial_pose, config.estimator.initial_sigmas
+        self._first = None if first is None else PoseWithCovariance(np.array(first), np.diag(np.square(sigmas)))
+        self._config = with_values(config, "estimator", {"initial_pose": None})
         self.map = landmark_map
         self._fingerprint = fingerprint(landmark_map)
         self._resumed = resumed
-        self._reset: PoseWithCovariance | None = None  # a pose that was given, for the next step
+        self._reset = self._first if resumed is None else None  # a pose that was given, for the next step
         self._last_step: Step | None = None
         self._odometry: MotionEvent | None = None  # the newest that gives a pose
         self._fastest = (0.0, 0.0)
@@ -337,6 +341,8 @@ class OnlineRun:
             self._past_rejections += old.rejections
         self.map, self._fingerprint = landmark_map, fingerprint(landmark_map)
         self._resumed, self._reset, self.newest, self._notes = state, None, None, []
+        if state is None:
+            self._reset = self._first
 
     def _begin(self, landmark_map: LandmarkMap | None, state: RunState | None) -> Assembly:
         parts = assemble_stream(self.facts, landmark_map, self._config, keep_all=landmark_map is None)

@@ -229,13 +229,15 @@ def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> t
     if motion is not None:
         cov, how = _odometry_cov(state, motion, gap_s, config), "the odometry went on and has measured the motion since"
     else:
-        motion, how = np.zeros(3), "nothing has measured the motion since"
+        how = "nothing has measured the motion since"
         speed, turn = max(state.fastest[0], _LEAST_SPEED), max(state.fastest[1], _LEAST_TURN)
         cov = np.diag(np.square([speed * gap_s, speed * gap_s, turn * gap_s]) + 1e-9)
-    ad = se2.adjoint(se2.inverse(motion))
-    belief = PoseWithCovariance(se2.compose(saved.pose, motion), ad @ saved.cov @ ad.T + cov)
+    moved = np.zeros(3) if motion is None else motion
+    ad = se2.adjoint(se2.inverse(moved))
+    belief = PoseWithCovariance(se2.compose(saved.pose, moved), ad @ saved.cov @ ad.T + cov)
     x, y, yaw = np.sqrt(np.diag(belief.cov))
     if max(x, y) > _USELESS_M or yaw > _USELESS_RAD:
+        how += "" if motion is None else " too badly"
         return None, f"Resumed {gap_s:.1f} s later; {how}, so the pose is searched for on the whole map."
     return belief, f"Resumed {gap_s:.1f} s later; {how}: the pose is known to {math.hypot(x, y):.2f} m, {yaw:.2f} rad."
 

@@ -88,6 +88,8 @@ class RangeBearingInput(EventInput):
 
     def ranges(self, stamp_ns: int, landmarks: Iterable[tuple[int, float, float]], frame_id: str = BASE) -> None:
         """Landmarks by id, range [m] and bearing [rad], counter-clockwise from the sensor's x axis."""
+        if (odd := next((i for i, _, _ in landmarks if float(i) != int(i)), None)) is not None:
+            raise ValueError(f"a landmark's id is {odd}, expected a whole number")
         found = tuple(RangeBearing(int(i), float(r), float(b)) for i, r, b in landmarks)
         self._deliver(RangeBearingEvent(*self._when("sightings", stamp_ns), frame_id, found))
 

@@ -29,6 +29,7 @@ from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
 from fgloc.live import process as estimation_process
 from fgloc.live.engine import DetectionWorker, Keep, LiveStatus, Queued, Settings, State
+from fgloc.live.live import begun_at
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
@@ -512,6 +513,21 @@ def test_a_pose_that_is_told_is_taken_and_sightings_win_over_a_wrong_one():
         live.reset_pose((2.0, 2.0, 3.0), (0.05, 0.05, 0.05))
         made = feed(live, light[len(until(1.0, light)) :])
         assert any("jumped" in note for note in live.status().notes)
+    assert errors(world, made[-10:]).max() < 0.06
+    assert made[-1].mode is Mode.OK
+
+
+@pytest.mark.parametrize("miss", [(0.0, 0.0, 0.0), (0.7, -0.4, 0.1), (2.0, 2.0, 3.0)])
+def test_sightings_win_over_a_wrong_first_pose_and_the_bound_holds_until_then(miss):
+    world = World(room(), seconds=9.0)
+    given = begun_at(config(), (truth_at(0.0) + miss).tolist(), "--initial-pose")
+    with Live(given, room(), roles=("odometry", "command")) as live:
+        live.camera_info(640, 480, CAMERA.K, np.zeros(4), frame_id="cam")
+        live.transform("base_link", "cam", CAMERA.T_base_cam[:3, 3], [-0.5, 0.5, -0.5, 0.5])
+        made = feed(live, world.events())
+    bounds = [estimate.protection.position_m for estimate in made if estimate.protection is not None]
+    assert len(bounds) == len(made) > 20
+    assert (errors(world, made) < bounds).all()
     assert errors(world, made[-10:]).max() < 0.06
     assert made[-1].mode is Mode.OK
 

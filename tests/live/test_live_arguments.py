@@ -1,11 +1,15 @@
 """Values that `fgloc.Live` cannot use: one kind of error, which has the value; nothing is taken silently."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from fgloc import Live
 from fgloc.config import Config
-from fgloc.errors import EstimatorError
+from fgloc.errors import ConfigError, EstimatorError
+from fgloc.live.live import TYPED_SIGMAS, begun_at
 from fgloc.types import ControlEvent
 
 T = 1_700_000_000_000_000_000
@@ -50,6 +54,7 @@ def test_whole_stamps_of_any_kind(whole):
         ("command", (T, (0.1, 0.2), 0.0), (0.1, 0.2)),
         ("ranges", (T, [(1, 2.0)]), [(1, 2.0)]),
         ("ranges", (T, [(1, 2.0, None)]), [(1, 2.0, None)]),
+        ("ranges", (T, [(1.5, 2.0, 0.1)]), 1.5),
         ("corners", (T, {7: [(1.0, 2.0), (3.0, 4.0)]}), [(1.0, 2.0), (3.0, 4.0)]),
         ("image", (T, [1, 2]), [1, 2]),
         ("camera_info", (640, 480, (1.0, 2.0)), (1.0, 2.0)),
@@ -71,3 +76,34 @@ def test_an_argument_of_another_shape_is_named_with_its_value(method, arguments,
 def test_a_call_without_its_arguments_is_pythons_own_error():
     with Live(Config(), roles=ODOMETRY) as live, pytest.raises(TypeError):
         live.odometry()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "value"),
+    [
+        ({"config": {}}, "{}"),
+        ({"config": Path("robot.yaml")}, "robot.yaml"),
+        ({"landmark_map": "map.yaml"}, "'map.yaml'"),
+        ({"state": "run.state"}, "'run.state'"),
+        ({"roles": "joints"}, "'joints'"),
+    ],
+)
+def test_an_argument_of_another_type_is_named_with_its_value(arguments, value):
+    with pytest.raises(ConfigError, match=next(iter(arguments))) as caught:
+        Live(**({"config": Config()} | arguments))
+    assert value in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "pose", [(1.0, 2.0, 90.0), (float("nan"), 0.0, 0.0), (0.0, 0.0, float("inf")), (1e12, 0.0, 0.0)]
+)
+def test_a_first_pose_that_no_file_may_have_is_refused(pose):
+    with pytest.raises(ConfigError, match=re.escape(f"--initial-pose {pose[0]:g}, {pose[1]:g}, {pose[2]:g}")):
+        begun_at(Config(), pose, "--initial-pose")
+
+
+def test_a_typed_first_pose_is_as_uncertain_as_a_click_unless_the_configuration_says():
+    exact = Config.model_validate({"estimator": {"initial_sigmas": (0.01, 0.01, 0.02)}})
+    for config, sigmas in ((Config(), TYPED_SIGMAS), (exact, (0.01, 0.01, 0.02))):
+        estimator = begun_at(config, (1.0, 2.0, 0.5), "--initial-pose").estimator
+        assert (estimator.initial_pose, estimator.initial_sigmas) == ((1.0, 2.0, 0.5), sigmas)

@@ -145,7 +145,8 @@ def test_a_live_estimate_that_runs_away_is_replaced_by_odometry_and_named(monkey
 @pytest.mark.parametrize("severity", list(Severity))
 def test_an_error_is_in_the_level_of_the_diagnostics_and_in_the_exit_code(severity):
     status = LiveStatus(mode=Mode.OK, findings=(Finding("sightings.mirrored", "It is mirrored.", severity),))
-    _, values = described(status)
+    message, values = described(status)
+    assert ("It is mirrored." in message) == (severity is Severity.ERROR)
     assert any("sightings.mirrored" in key for key in values) == (severity is not Severity.NOTE)
     assert exit_code(status) == (EXIT_LOST if severity is Severity.ERROR else 0)
     wrong = severity is Severity.ERROR

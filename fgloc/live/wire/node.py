@@ -17,6 +17,7 @@ from fgloc.config import Config, RecordingConfig, Role, base_role
 from fgloc.errors import FglocError, WireError
 from fgloc.frames import quaternion_yaw
 from fgloc.live import Live, LivePose, LiveStatus
+from fgloc.live.live import TYPED_SIGMAS
 from fgloc.live.process import EstimationProcess
 from fgloc.live.run import LOOK, MOTION
 from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, odom_in_map
@@ -294,7 +295,10 @@ class Node:
             while not stop.wait(_POLL_S):
                 if self._failure is not None:
                     raise self._failure
-                teller.waiting(self.intake.find())
+                missing = self.intake.find()
+                if not missing and self.live is None and not self._process.ready:
+                    missing = "Waiting for the process that estimates to start."
+                teller.waiting(missing)
                 if self.live is None and self.intake.roles and self._process.ready:
                     self._start()
                     publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
@@ -370,7 +374,7 @@ class Node:
         """
         q, variances = given.pose.orientation, np.asarray(given.covariance)[[0, 7, 35]]
         if not (variances > 0.0).all():
-            variances = np.square(self._config.estimator.initial_sigmas)
+            variances = np.square(TYPED_SIGMAS)
         pose = (given.pose.position.x, given.pose.position.y, quaternion_yaw((q.x, q.y, q.z, q.w)))
         farthest, widest = self._config.gate.max_position, self._config.gate.max_variance
         if not np.abs(pose).max() <= farthest:  # nor with a NaN in it
@@ -489,5 +493,6 @@ def described(status: LiveStatus | None) -> tuple[str, dict[str, str]]:
     if status.stale:
         return status.stale, values
     if status.mode is not None:
-        return status.alert or str(status.mode), values
+        wrong = next((f": {f.text}" for f in status.findings if f.severity is Severity.ERROR), "")
+        return status.alert or f"{status.mode}{wrong}", values
     return f"waiting for {'; '.join(status.waiting_for)}" if status.waiting_for else "no pose yet", values

@@ -10,6 +10,7 @@ from typing import Any
 
 from fgloc.config import Config, load_config, role_names
 from fgloc.errors import ConfigError
+from fgloc.live.live import begun_at
 from fgloc.live.wire.node import RATE_HZ, Publishing
 from fgloc.recording.transforms import TF_TOPIC
 from fgloc.sensors.maps import configured_map
@@ -121,7 +122,7 @@ def _with_initial_pose(config: Config, given: Any) -> Config:
     numbers = [float(value) for value in pose if isinstance(value, (int, float)) and math.isfinite(value)]
     if not len(numbers) == len(pose) == 3:
         raise ConfigError(f"initial_pose {given}: expected x, y [m] and yaw [rad], such as [1.5, -0.2, 3.14]")
-    return _changed(config, "estimator", initial_pose=tuple(numbers))
+    return begun_at(config, numbers, "initial_pose")
 
 
 def _changed(config: Config, section: str, **values: Any) -> Config:
