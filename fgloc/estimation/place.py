@@ -28,6 +28,7 @@ from fgloc.types import FloatArray, LandmarkMap, MotionMeasurement, MotionReadin
 _MAX_SEEDS = 6  # places to start from, and sightings that tell them
 _KNOWN_SEEDS = 1  # of a robot whose place is known: the newest, which any other place has to explain, too
 _MOST_SENSED = 64  # readings of registered sensors that are weighed together where no pose is known: two rows each
+_MOST_RANKING = 12  # of them, by which the hundreds of candidates about anchors are ranked
 _SELDOM_MISREAD = 3  # landmarks of one image: so many with wrong ids do not agree with any place
 _POSE_SEEDS = 2  # measurements of registered sensors, whose places are tried
 
@@ -51,7 +52,8 @@ class PlaceSearch:
         if known and len({m.landmark_id for m in here}) < 2 and not _lasting(here, self._window_ns):
             return None  # one landmark alone may have been moved, or misread
         fitted = PoseFit(here, self._factors)
-        candidates = sorted(self._candidates(here, known), key=lambda c: float(fitted.costs(c)[0].sum()))
+        rough = PoseFit(_spread(here, _MOST_RANKING), self._factors) if sensed else fitted
+        candidates = sorted(self._candidates(here, known), key=lambda c: float(rough.costs(c)[0].sum()))
         fits = [fit for c in candidates[:_MAX_SEEDS] if (fit := fitted.solve(c)) is not None]
         places: list[Fit] = []
         for fit in sorted(fits, key=lambda fit: fit.cost):
@@ -125,7 +127,7 @@ def _lasting(sightings: Sequence[LandmarkMeasurement], window_ns: int) -> bool:
 
 ANYWHERE = np.diag([FAR_M2, FAR_M2, se2.ANY_YAW])  # the yaw may be any, with equal probability
 ORIGIN = ROUNDING * np.eye(se2.DOF)  # of a first pose that is the origin by definition
-# After initialise_s in vain it is tried no more often than this: a new sighting seldom changes the result of 5 s.
+# After initialise_s in vain, or by registered sensors alone, it is tried no more often: a new sighting changes little.
 _RETRY_S = 1.0
 _SENSORS_WINDOW_S = 60.0  # positions and ranges without a map tell the yaw by the way: a robot goes 12 m at 0.2 m/s
 
@@ -243,7 +245,8 @@ class GlobalSearch:
             return None
         if named and self._since_ns is None:
             self._since_ns = step.stamp_ns
-        due = named and self._due(step.stamp_ns)
+        sensed = not any(m.of_landmark for c in self._steps for m in c.sightings)
+        due = named and self._due(step.stamp_ns, sensed)
         best = self._places.find(list(self._compensated()), tracked is not None) if due else None
         if best is None:
             return None
@@ -263,10 +266,15 @@ class GlobalSearch:
         self.constellations.take(unnamed)
         return self.constellations.place(step.stamp_ns, tracked is not None) if unnamed else None
 
-    def _due(self, stamp_ns: int) -> bool:
-        """Whether it is time to look for a place; bounds the work per second of a search that finds none."""
+    def _due(self, stamp_ns: int, sensed: bool) -> bool:
+        """Whether it is time to look for a place; bounds the work per second of a search that finds none.
+
+        Args:
+            stamp_ns: of the step.
+            sensed: there are ranges and positions only, of which the yaw follows from the way of seconds.
+        """
         since, patience_ns = self._since_ns or stamp_ns, self._config.estimator.initialise_s * 1e9
-        if stamp_ns > since + patience_ns and 0 <= stamp_ns - self._tried_ns < _RETRY_S * 1e9:
+        if (sensed or stamp_ns > since + patience_ns) and 0 <= stamp_ns - self._tried_ns < _RETRY_S * 1e9:
             return False
         self._tried_ns = stamp_ns
         return True
