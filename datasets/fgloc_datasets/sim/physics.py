@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import mujoco
@@ -69,17 +69,7 @@ class Log:
         return Log(**parts, commands=self.commands, ticks=len(parts["stamps_s"]))
 
 
-_PER_TICK = (
-    "stamps_s",
-    "positions",
-    "quaternions",
-    "velocities",
-    "rates",
-    "wheel_angles",
-    "wheel_rates",
-    "torques",
-    "steering",
-)
+_PER_TICK = tuple(field.name for field in fields(Log) if field.name not in ("commands", "ticks"))
 
 
 class Controller(Protocol):
@@ -272,13 +262,6 @@ class Regulator:
             self._integrals[i] = _clip(self._integrals[i] + motor.ki * error * dt, supply)
             out.append(_clip(motor.kp * error + self._integrals[i], supply))
         return out
-
-
-def center_of_mass(scene: Scene) -> FloatArray:
-    """Center of mass ``(3,)`` [m] of the whole robot in its base frame, wheels at rest."""
-    data = mujoco.MjData(scene.model)
-    mujoco.mj_forward(scene.model, data)
-    return np.array(data.subtree_com[scene.model.body("base").id])
 
 
 def base_twist(log: Log) -> FloatArray:
