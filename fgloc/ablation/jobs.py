@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -25,7 +26,7 @@ from fgloc.ablation.failures import corrupt, generators
 from fgloc.ablation.suite import Cell
 from fgloc.config import Config, files_of
 from fgloc.errors import FglocError, OutputError, RecordingError
-from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
+from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.evaluation.report import write_results
 from fgloc.files.outputs import sha256_of, write_json, write_text
 from fgloc.recording.reader import Recording, open_recording
@@ -89,9 +90,8 @@ def owner_path(out: Path, folder: str) -> Path:
 
 def read_record(out: Path, key: str) -> Record | None:
     """A job's record; None if it has none, or if its file is damaged: then the job has to run again."""
-    path = record_path(out, key)
     try:
-        return Record.model_validate_json(path.read_bytes())
+        return Record.model_validate_json(record_path(out, key).read_bytes())
     except (FileNotFoundError, ValidationError):
         return None
 
@@ -335,12 +335,11 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
         owner.unlink(missing_ok=True)  # the files may be those of a run with other settings
         write_results(result, config, out / job.folder, job.command, sha256_of(cell.bag))
         write_text(owner, job.key)
-    affected: dict[str, int] = {}
+    affected: Counter[str] = Counter()
     for scene in scenes:
-        for kind, n in scene.affected.items():
-            affected[kind] = affected.get(kind, 0) + n
+        affected.update(scene.affected)
     return {
-        "figures": _figures(metrics),
+        "figures": metrics.model_dump(mode="json", exclude=_COSTS),
         "modes": {mode.value: sum(m is mode for m in result.modes) / len(result.modes) for mode in Mode},
         "mistakes": result.mistakes,
         "sensors": sensors,
@@ -354,10 +353,6 @@ def _sensors(recording: Recording) -> tuple[str, ...]:
     roles = [topic.role for topic in recording.topics if topic.role is not None and topic.count]
     heard = {stream.event for role in roles for stream in streams_of(role)}
     return tuple(name for name, events in events_by_sensor().items() if heard.intersection(events))
-
-
-def _figures(metrics: Metrics) -> dict[str, Any]:
-    return metrics.model_dump(mode="json", exclude=_COSTS)
 
 
 def _track(result: RunResult, config: Config) -> Track | None:

@@ -113,14 +113,13 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
     distributed.wait(
         [client.submit(_prepare, job, out, key=f"detect-{images}", pure=False) for images, job in shared.items()]
     )
-    key_of = {client.submit(_attempt, job, out, key=job.key, pure=False, retries=0): job.key for job in todo}
-    futures = list(key_of)
+    futures = [client.submit(_attempt, job, out, key=job.key, pure=False, retries=0) for job in todo]
     for future in distributed.as_completed(futures):
-        error = future.exception() if future.status == "error" else _unwritable(future.result())
+        error = future.exception() if future.status == "error" else future.result()
         if error is not None and not isinstance(error, distributed.KilledWorker):
             raise error
         said = None if error is None else f"its worker died {_DEATHS + 1} times while it ran"
-        yield key_of[future], said
+        yield future.key, said
         future.release()
 
 
@@ -143,16 +142,13 @@ def _prepare(job: Job, out: Path) -> None:
         detect(job, out)
 
 
-def _attempt(job: Job, out: Path) -> str | OutputError:
+def _attempt(job: Job, out: Path) -> OutputError | None:
     """Execute a job; return an error of output instead of raising it, as the worker would log that at length."""
     try:
-        return execute(job, out)
+        execute(job, out)
     except OutputError as error:
         return error
-
-
-def _unwritable(result: object) -> OutputError | None:
-    return result if isinstance(result, OutputError) else None
+    return None
 
 
 @contextmanager
