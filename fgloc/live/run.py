@@ -237,7 +237,7 @@ class LiveFacts:
         if given_pose(config, "optical") is not None:
             return ""
         frame = camera_frame(seen)
-        base_name = base_frame(self, self._config, self.first)
+        base_name = base_frame(self, self._config)
         if frame.lstrip("/") != base_name.lstrip("/") and not (frame in self.frames and base_name in self.frames):
             return f"no transform from {base_name} to {frame!r} yet, and no recording.sightings_pose"
         return ""

@@ -27,7 +27,7 @@ from fgloc.frames import rotations
 from fgloc.intake.keyframing import EventBuffer
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import base_ground, base_pose, lacks_yaw
-from fgloc.sensor_setup import mounted_up
+from fgloc.sensor_setup import RecordingFacts, mounted_up
 from fgloc.sensors.base import Mounting, WheelJoints
 from fgloc.sensors.commands import told
 from fgloc.sensors.gyro import Gyro, ImuEvent
@@ -359,7 +359,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
                 truth.append(event)
             else:
                 sensed.append(event)
-        up = mounted_up(recording, settings, {type(event): event for event in reversed(sensed)})
+        up = mounted_up(RecordingFacts(recording), settings)
     if truth_from is None:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
         if len(truth) > 1:
