@@ -27,7 +27,7 @@ from fgloc.ablation.suite import FailureEntry
 from fgloc.config import Config, Role, config_of
 from fgloc.errors import ConfigError, EstimatorError
 from fgloc.files.atomic import atomic_folder
-from fgloc.files.settings import sentences
+from fgloc.files.settings import merged, sentences
 from fgloc.live import Live
 from fgloc.recording.reader import MessageEvents
 from fgloc.sensors.failures import Failure
@@ -222,11 +222,6 @@ def pose_source(
 
 def changed(config: Config, changes: dict[str, Any]) -> Config:
     """The configuration with some of its values replaced, given as nested mappings."""
-
-    def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-        inner = {k: merged(old.get(k) or {}, v) if isinstance(v, dict) else v for k, v in new.items()}
-        return {**old, **inner}
-
     return config_of(merged(config.model_dump(exclude_unset=True), changes))
 
 
