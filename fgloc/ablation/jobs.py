@@ -42,29 +42,29 @@ from fgloc.types import Mode, TruthEvent
 # --- Records, written whole or not at all, and a line for every attempt -----------------------------------------------
 
 
-class Track(BaseModel):
-    """Estimate and truth at common times, for a picture [m]."""
+class _Kept(BaseModel):
+    """Contents of a file, or a part of them: unknown keys are errors, values are immutable."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Track(_Kept):
+    """Estimate and truth at common times, for a picture [m]."""
 
     estimate: list[tuple[float, float]]
     truth: list[tuple[float, float]]
 
 
-class Cost(BaseModel):
+class Cost(_Kept):
     """Wall time, CPU time and peak memory of one run; never the same twice."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seconds: float
     cpu_s: float
     peak_mb: float
 
 
-class Record(BaseModel):
+class Record(_Kept):
     """Result of a job's run. All fields but ``cost`` depend on the inputs alone."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     key: str
     outcome: Literal["done", "refused", "crashed"]
@@ -157,10 +157,8 @@ _SOURCES_LEFT_OUT = (
 _COSTS = {"real_time_factor", "step_ms"}
 
 
-class Job(BaseModel):
+class Job(_Kept):
     """A cell and the hash of everything that its result depends on."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     key: str
     cell: Cell
