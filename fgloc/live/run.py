@@ -32,7 +32,6 @@ from fgloc.live.state import (
     matrix3,
     odometry_state,
     resumed_installation,
-    row3,
 )
 from fgloc.recording.transforms import FrameTree
 from fgloc.sensor_setup import base_frame, camera_frame, given_pose
@@ -443,11 +442,11 @@ class OnlineRun:
             map_fingerprint=self._fingerprint,
             saved_ns=time.time_ns(),
             stamp_ns=estimate.stamp_ns,
-            pose=row3(estimate.pose),
+            pose=se2.triple(estimate.pose),
             cov=matrix3(_body_cov(estimate)),
             mode=estimate.mode,
             fastest=self._fastest,
-            twist=row3(twist),
+            twist=se2.triple(twist),
             installation=InstallationState(
                 names=localizer.factors.installation.names,
                 mean=tuple(installed.mean.tolist()),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
+from fgloc import se2
 from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError
 from fgloc.sensors.learned.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, ModelCard, Row
@@ -144,7 +145,7 @@ def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Ro
     e, basis, (window_s, of_window) = np.concatenate(errors), np.concatenate(composed), _distinct(lengths)
 
     def fitted(times_s: tuple[float, ...], start: FloatArray) -> tuple[FloatArray, float]:
-        all_hidden = ErrorMemory(time_s=_row(np.array(times_s)), share=(_ALMOST_ONE,) * 3)
+        all_hidden = ErrorMemory(time_s=se2.triple(times_s), share=(_ALMOST_ONE,) * 3)
         shown = np.array([all_hidden.growth(horizon) for horizon in window_s])[of_window, :, None, None]
         of_short = _MIN_LONG * shown + 1.0 - shown
         return _most_likely(e, np.concatenate([shown * basis, of_short * basis], axis=1), start)
@@ -159,7 +160,7 @@ def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Ro
     more, short = np.maximum(best, _MIN_FACTOR).reshape(2, 3)
     long = more + _MIN_LONG * short
     share = np.minimum(1.0 - short / long, _ALMOST_ONE)
-    return _row(long), ErrorMemory(time_s=_row(np.array(times_s)), share=_row(share))
+    return se2.triple(long), ErrorMemory(time_s=se2.triple(times_s), share=se2.triple(share))
 
 
 def fit_joint(learned: list[Rollout], wheels: list[Rollout], config: CalibrationConfig) -> JointErrors:
@@ -242,12 +243,7 @@ def _diagonal(values: FloatArray, axes: list[int]) -> FloatArray:
 
 
 def _rows(matrix: FloatArray) -> Matrix:
-    x, y, yaw = (_row(row) for row in matrix)
-    return x, y, yaw
-
-
-def _row(values: FloatArray) -> Row:
-    x, y, yaw = (float(v) for v in values)
+    x, y, yaw = map(se2.triple, matrix)
     return x, y, yaw
 
 
