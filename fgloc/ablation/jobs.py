@@ -167,14 +167,14 @@ class Job(_Kept):
     command: str = ""  # for those files
 
 
-def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, command: str = "") -> list[Job]:
+def make_jobs(cells: Sequence[Cell], in_folders: bool = False, command: str = "") -> list[Job]:
     """Name each cell by the SHA-256 of recording, map, model, configuration, failures, seed and code.
 
     Two cells with the same inputs get the same key, and run once.
 
     Args:
         cells: from `expand`.
-        folders: recording -> folder for all files of its run; None: figures alone are kept.
+        in_folders: all files of a run are kept, in a folder of its recording's name; else figures alone.
         command: what the user typed, for those files.
     """
     hashes: dict[Path, str] = {}
@@ -204,7 +204,7 @@ def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, c
         seen = {name: inputs[name] for name in ("bag", "map", "code")} | {"dictionary": cell.config.markers.dictionary}
         if any(failure.pixels for failure in cell.chain):
             seen |= {name: inputs[name] for name in ("chain", "seed")}
-        folder = None if folders is None else folders[cell.recording]
+        folder = cell.recording if in_folders else None
         if folder is not None:
             inputs["folder"] = folder
         jobs.append(Job(key=_hash(inputs), cell=cell, images=_hash(seen), folder=folder, command=command))

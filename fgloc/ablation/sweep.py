@@ -24,7 +24,7 @@ from fgloc.ablation.jobs import (
     record_path,
     write_record,
 )
-from fgloc.ablation.suite import NOTHING, Cell
+from fgloc.ablation.suite import Cell
 from fgloc.config import Config
 from fgloc.errors import ConfigError, FglocError, OutputError
 from fgloc.instrumentation import repeated
@@ -247,23 +247,9 @@ def plan_bags(bags: Sequence[Path], map_file: Path | None, configure: Callable[[
         except FglocError as error:
             errors[name] = str(error)
             continue
-        cells.append(
-            Cell(
-                recording=name,
-                variant="",
-                failure=NOTHING,
-                severity=None,
-                seed=0,
-                bag=bag,
-                map=map_file or find_beside(bag, "map.yaml"),
-                config_file=None,
-                config=config,
-                mode="batch",
-                start="configured",
-                chain=(),
-            )
-        )
-    jobs = make_jobs(cells, {name: name for name in names}, command)
+        map_path = map_file or find_beside(bag, "map.yaml")
+        cells.append(Cell(recording=name, bag=bag, map=map_path, config=config, mode="batch"))
+    jobs = make_jobs(cells, in_folders=True, command=command)
     return Plan(tuple(names), tuple(jobs), errors)
 
 
