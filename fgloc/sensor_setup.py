@@ -18,7 +18,7 @@ from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, homogeneous, rpy_matrix
 from fgloc.recording.reader import Recording
 from fgloc.recording.transforms import FrameTree
 from fgloc.sensors import registry
-from fgloc.sensors.base import Context, Sensor
+from fgloc.sensors.base import Context, Sensor, with_values
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.learned.sensor import LearnedMotion, learned_motion
 from fgloc.sensors.maps import configured_map
@@ -347,7 +347,7 @@ def resolved(config: Config, given_map: Path | LandmarkMap | None) -> Config:
     """The configuration a run uses: without a map landmarks are variables, which the fixed lag would forget."""
     if given_map is not None or config.estimator.kind != "fixed_lag":
         return config
-    return config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
+    return with_values(config, "estimator", {"kind": "isam2"})
 
 
 def base_frame(facts: StreamFacts, config: Config) -> str:

@@ -33,6 +33,7 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
+from fgloc.sensors.base import with_values
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
 from fgloc.sensors.markers.images import ImageError, ImageEvent
@@ -315,8 +316,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
             if corrupted is not landmark_map:
                 map_file = Path(folder) / "map.yaml"
                 write_map(corrupted, map_file)
-                metres = config.map.model_copy(update={"scale": 1.0, "size_scale": 1.0})
-                config = config.model_copy(update={"map": metres})
+                config = with_values(config, "map", {"scale": 1.0, "size_scale": 1.0})  # it is in metres
         result = run(
             cell.bag,
             map_file,
@@ -375,5 +375,4 @@ def start_at_truth(bag: Path, config: Config) -> Config:
     if first is None:
         raise RecordingError(f"{bag}: no truth to start from; use 'start: configured' and estimator.initial_pose")
     x, y, yaw = base_pose(first, config.truth).tolist()
-    estimator = config.estimator.model_copy(update={"initial_pose": (x, y, yaw)})
-    return config.model_copy(update={"estimator": estimator})
+    return with_values(config, "estimator", {"initial_pose": (x, y, yaw)})

@@ -215,14 +215,15 @@ def _shown(node: Node) -> tuple[str, bool, bool, str] | None:
 
 
 def _with_initial_pose(config: Config, text: str | None) -> Config:
+    from fgloc.sensors.base import with_values
+
     if text is None:
         return config
     try:
         x, y, yaw = (float(part) for part in text.split(","))
     except ValueError:
         raise ConfigError(f"--initial-pose {text}: expected x, y [m] and yaw [rad], such as 1.5,-0.2,3.14") from None
-    estimator = config.estimator.model_copy(update={"initial_pose": (x, y, yaw)})
-    return config.model_copy(update={"estimator": estimator})
+    return with_values(config, "estimator", {"initial_pose": (x, y, yaw)})
 
 
 def _exit_if_wrong(node: Node) -> None:
