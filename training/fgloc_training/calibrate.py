@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,9 @@ from scipy.signal import lfilter
 from fgloc import se2
 from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError
+from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, ModelCard, Row
-from fgloc.sensors.learned.network import calibrated
+from fgloc.sensors.learned.network import CommandHistory, calibrated
 from fgloc.sensors.learned.sensor import Tensors, model_of
 from fgloc.types import FloatArray
 from fgloc_training.config import AdaptationConfig, CalibrationConfig
@@ -39,16 +39,8 @@ _MIN_LONG = 0.1  # of what short windows show: what cancels in the end still lea
 _FIT_WINDOW_S = 2.0
 
 
-class MeanTwists(Protocol):
-    """Interface of commands, or of wheels in their place: means of v and ω."""
-
-    def means(self, limits_s: FloatArray) -> FloatArray:
-        """Mean (v, ω) ``(..., m - 1, 2)`` between limits ``(..., m)``."""
-        ...
-
-
 def fit_kinematics(
-    runs: list[Run], twists_of: Callable[[Run], MeanTwists] = lambda run: run.track, sideways: bool = False
+    runs: list[Run], twists_of: Callable[[Run], CommandHistory | Signal] = lambda run: run.track, sideways: bool = False
 ) -> Kinematics:
     """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
 
