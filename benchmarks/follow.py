@@ -55,8 +55,8 @@ from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.files.atomic import atomic_file
 from fgloc.runner import run
 from fgloc_datasets.sim.camera import RenderError
-from fgloc_datasets.sim.following import PoseName, follow
 from fgloc_datasets.sim.following.cases import drive_of
+from fgloc_datasets.sim.following.loop import PoseName, follow
 
 Split = Literal["validation", "test"]
 SEEDS: dict[Split, tuple[int, ...]] = {"validation": (141, 142, 143), "test": tuple(range(161, 171))}

@@ -247,7 +247,7 @@ def _simulation(place: Path) -> Writer:
 
 
 def _training(place: Path) -> Writer:
-    from fgloc_training.train import Reporter, train_models
+    from fgloc_training.train import train_models
     from tests.support.synthetic_robot import write_bag
 
     out = place / "train" / "out"
@@ -267,7 +267,7 @@ def _training(place: Path) -> Writer:
         config = place / f"train{seed}.yaml"
         changed = settings | {"optimization": {"seed": seed, "iterations": 4, "validate_every": 2, "batch": 8}}
         config.write_text(yaml.safe_dump(changed))
-        train_models(config, data, out, None, Reporter(lambda _: None, lambda _: None))
+        train_models(config, data, out, None, lambda _: None, lambda _: None)
 
     return Writer("train", out, lambda: run(1), lambda: run(2))
 

@@ -79,25 +79,18 @@ __all__ = [
 ]
 
 _IMPORTED_LATE = {
-    "Config": "fgloc.config",
-    "Section": "fgloc.config",
-    "load_config": "fgloc.config",
-    "Results": "fgloc.evaluation.results",
-    "read_results": "fgloc.evaluation.results",
-    "Live": "fgloc.live",
-    "run": "fgloc.runner",
-    "Context": "fgloc.sensors.base",
-    "Sensor": "fgloc.sensors.base",
-    "Stream": "fgloc.sensors.base",
-    "load_map": "fgloc.sensors.maps",
-    "Decision": "fgloc.types",
-    "Estimate": "fgloc.types",
-    "LandmarkMap": "fgloc.types",
-    "Mode": "fgloc.types",
-    "PoseMeasurement": "fgloc.sensors.measurements",
-    "RunResult": "fgloc.runner",
-    "SensorEvent": "fgloc.types",
-    "Trajectory": "fgloc.types",
+    name: module
+    for module, names in (
+        ("fgloc.config", ("Config", "Section", "load_config")),
+        ("fgloc.evaluation.results", ("Results", "read_results")),
+        ("fgloc.live", ("Live",)),
+        ("fgloc.runner", ("RunResult", "run")),
+        ("fgloc.sensors.base", ("Context", "Sensor", "Stream")),
+        ("fgloc.sensors.maps", ("load_map",)),
+        ("fgloc.sensors.measurements", ("PoseMeasurement",)),
+        ("fgloc.types", ("Decision", "Estimate", "LandmarkMap", "Mode", "SensorEvent", "Trajectory")),
+    )
+    for name in names
 }
 
 # Larger images are rejected, by their headers: finding markers takes some 30 bytes a pixel. OpenCV reads this when it

@@ -52,7 +52,9 @@ def calibrate(
         return calibrate_by_truth(bags, config)
     now = config
     for _ in range(_ROUNDS):
-        settings = _pooled([_calibrated(bag, map_path, now, progress) for bag in bags], now)
+        results = [_calibrated(bag, map_path, now, progress) for bag in bags]
+        maps = {None if r.landmarks is None else r.landmarks.source for r in results}
+        settings = pooled([r.found for r in results if r.found is not None], maps, now)
         values = {_key(s): round(s.found, 7) for s in _of_odometer(settings)}
         now = with_wheels(now, values)
     given = {s.name: _given(s, config) for s in _of_odometer(settings)}
@@ -114,11 +116,6 @@ def _calibrated(bag: Path, map_path: Path | None, config: Config, progress: Prog
             "sightings contradict every motion (begin with nearer ones)"
         )
     return result
-
-
-def _pooled(results: Sequence[RunResult], config: Config) -> tuple[Setting, ...]:
-    founds = [r.found for r in results if r.found is not None]
-    return pooled(founds, {None if r.landmarks is None else r.landmarks.source for r in results}, config)
 
 
 def pooled(founds: Sequence[InstallationFound], maps: Collection[str | None], config: Config) -> tuple[Setting, ...]:

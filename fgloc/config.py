@@ -786,7 +786,8 @@ class Config(SensorSections):
         if self.cameras and self.camera != CameraConfig():
             raise ValueError("camera is one camera and cameras are several; give one of the two sections")
         recording = _with_topics(self.recording, self.cameras)
-        if asked := {role for role, (name, key) in optional_roles().items() if _has(self, name, key)}:
+        settings = ((role, getattr(self, name, None), key) for role, (name, key) in optional_roles().items())
+        if asked := {role for role, section, key in settings if getattr(section, key, None)}:
             recording = recording.model_copy(update={"topics": recording.topics.asking(asked)})
         self.__dict__["recording"] = recording
         return self
@@ -802,17 +803,9 @@ class Config(SensorSections):
             update={"image": image, "camera_info": info, "sightings": sightings}
         )
         alone = {camera_role(name, role): role for role in CAMERA_ROLES}
-        update = {
-            "topics": topics,
-            "received_stamps": tuple(alone.get(role, role) for role in recording.received_stamps),
-            "stamp_offset_s": {alone.get(role, role): s for role, s in recording.stamp_offset_s.items()},
-            "sightings_pose": entry.pose,
-            "sightings_axes": entry.axes,
-        }
+        read = _renamed(recording, alone, topics=topics, sightings_pose=entry.pose, sightings_axes=entry.axes)
         camera = CameraConfig.model_validate(own)
-        return self.model_copy(
-            update={"camera": camera, "cameras": {}, "recording": recording.model_copy(update=update)}
-        )
+        return self.model_copy(update={"camera": camera, "cameras": {}, "recording": read})
 
     def with_camera(self, name: str, alone: Config) -> Config:
         """The configuration after that of `of_camera` was changed: what is the camera's own goes to its section."""
@@ -824,16 +817,9 @@ class Config(SensorSections):
             own |= {"pose": recording.sightings_pose, "axes": recording.sightings_axes}
         cameras = {**self.cameras, name: entry.model_copy(update=own)}
         named = {role: camera_role(name, role) for role in CAMERA_ROLES}
-        update = {
-            "topics": self.recording.topics,
-            "received_stamps": tuple(named.get(role, role) for role in recording.received_stamps),
-            "stamp_offset_s": {named.get(role, role): s for role, s in recording.stamp_offset_s.items()},
-            "sightings_pose": self.recording.sightings_pose,
-            "sightings_axes": self.recording.sightings_axes,
-        }
-        return alone.model_copy(
-            update={"camera": self.camera, "cameras": cameras, "recording": recording.model_copy(update=update)}
-        )
+        shared = {key: getattr(self.recording, key) for key in ("topics", "sightings_pose", "sightings_axes")}
+        read = _renamed(recording, named, **shared)
+        return alone.model_copy(update={"camera": self.camera, "cameras": cameras, "recording": read})
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -845,6 +831,15 @@ class Config(SensorSections):
         if type(self) is Config:
             return super().__reduce_ex__(protocol)
         return config_of, (self.model_dump(exclude_unset=True),)
+
+
+def _renamed(recording: RecordingConfig, names: Mapping[Role, Role], **changes: Any) -> RecordingConfig:
+    """The recording's section with the roles of its stamps under other names, and with further changes."""
+    stamps = {
+        "received_stamps": tuple(names.get(role, role) for role in recording.received_stamps),
+        "stamp_offset_s": {names.get(role, role): s for role, s in recording.stamp_offset_s.items()},
+    }
+    return recording.model_copy(update=stamps | changes)
 
 
 def _with_topics(recording: RecordingConfig, cameras: Mapping[str, NamedCameraConfig]) -> RecordingConfig:
@@ -872,11 +867,6 @@ def optional_roles() -> dict[Role, tuple[str, str]]:
 def _optional_roles(sensors: tuple[type[Any], ...]) -> dict[Role, tuple[str, str]]:
     asked = [sensor for sensor in sensors if getattr(sensor, "optional", False)]
     return {stream.role: (sensor.name, sensor.needs) for sensor in asked for stream in sensor.streams}
-
-
-def _has(config: Config, section: str, key: str) -> bool:
-    """Whether a setting of a registered sensor is given."""
-    return bool(getattr(getattr(config, section, None), key, None))
 
 
 def config_type() -> type[Config]:

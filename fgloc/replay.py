@@ -300,12 +300,10 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     probability = config.estimator.gate_probability
     factors = of_whole_run(log, localizer.factors)
     solver, contradiction = smoothed_within_priors(log, factors, config.batch, probability)
-    notes = []
     result, installed = solver.result(), solver.installed()
     if contradiction is not None:
-        result.covs[:] += spread(
-            result.poses, contradiction.rivals or ()
-        )  # a view of `ground_covs`, where there is one
+        # a view of `ground_covs`, where there is one
+        result.covs[:] += spread(result.poses, contradiction.rivals or ())
         installed = as_given(installed, factors.installation, contradiction.names)
     added = log.added_covs()
     grounds = _ground(solver, result, added)
@@ -316,10 +314,8 @@ def smooth_run(parts: Assembly) -> SmoothedRun:
     landmarks = parts.landmark_map
     if landmarks is None and result.landmarks:
         landmarks = LandmarkMap(result.landmarks, source="estimated")
-    notes.append(f"Batch: {len(estimates)} keyframes, cost {result.error:.1f}.")
-    return SmoothedRun(
-        estimates, landmarks, tuple(notes), factors.installation, installed, solver.cost(), contradiction
-    )
+    notes = (f"Batch: {len(estimates)} keyframes, cost {result.error:.1f}.",)
+    return SmoothedRun(estimates, landmarks, notes, factors.installation, installed, solver.cost(), contradiction)
 
 
 def _ground(solver: BatchSmoother, result: Smoothed, added: Sequence[FloatArray]) -> Iterator[Ground | None]:

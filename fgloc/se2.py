@@ -21,6 +21,12 @@ DOF = 3  # of a pose or motion
 ANY_YAW = math.pi**2 / 3.0  # rad²: variance of a yaw that may be any, with equal probability
 
 
+def triple(values: Triple) -> tuple[float, float, float]:
+    """Three numbers of an array ``(3,)`` as a tuple."""
+    x, y, z = map(float, values)
+    return x, y, z
+
+
 def wrap(angle: float) -> float:
     """Wrap an angle [rad] into [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

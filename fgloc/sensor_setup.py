@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
@@ -13,11 +14,11 @@ import numpy as np
 from fgloc.config import CAMERA_ROLES, Config, Role, base_roles, camera_role
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.extensions import outside_sensors
-from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, rpy_matrix
+from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, homogeneous, rpy_matrix
 from fgloc.recording.reader import Recording
 from fgloc.recording.transforms import FrameTree
 from fgloc.sensors import registry
-from fgloc.sensors.base import Context, Sensor
+from fgloc.sensors.base import Context, Sensor, with_values
 from fgloc.sensors.cameras import camera_from_info, corrected, load_camera, rescaled
 from fgloc.sensors.learned.sensor import LearnedMotion, learned_motion
 from fgloc.sensors.maps import configured_map
@@ -40,16 +41,7 @@ from fgloc.types import (
 _SCAN_EVENTS = 20_000  # how far into a recording an image that can be decoded is looked for
 
 
-class HasFrames(Protocol):
-    """Interface of an object with transforms."""
-
-    @property
-    def frames(self) -> FrameTree:
-        """All transforms between frames."""
-        ...
-
-
-class StreamFacts(HasFrames, Protocol):
+class StreamFacts(Protocol):
     """Facts of a stream that are known before it is run."""
 
     @property
@@ -65,6 +57,11 @@ class StreamFacts(HasFrames, Protocol):
     @property
     def topics(self) -> str:
         """All topics with their types, for messages to the user."""
+        ...
+
+    @property
+    def frames(self) -> FrameTree:
+        """All transforms between frames."""
         ...
 
     @property
@@ -116,28 +113,21 @@ class RecordingFacts:
     @cached_property
     def firsts(self) -> Iterable[Event]:
         """The first event of each kind on each topic, from as far as it takes for each to have a message."""
-        return _firsts(self._recording)
+        found: dict[tuple[type[Event], str], Event] = {}
+        missing = set(self.roles.values())
+        for event in self._recording.events():
+            found.setdefault((type(event), event.topic), event)
+            missing.discard(event.topic)
+            if not missing:
+                break
+        return tuple(found.values())
 
     def image_size(self, topic: str | None) -> tuple[int, int] | None:
         """Width and height of the first image near the beginning of a topic that can be decoded."""
-        some = (event for _, event in zip(range(_SCAN_EVENTS), self._recording.events(), strict=False))
-        return first_size(event for event in some if event.topic == topic)
-
-
-def first_events(recording: Recording) -> dict[type[Event], Event]:
-    """The first event of each kind, from as far into the recording as it takes for every topic to have a message."""
-    return _by_kind(_firsts(recording))
-
-
-def _firsts(recording: Recording) -> tuple[Event, ...]:
-    found: dict[tuple[type[Event], str], Event] = {}
-    missing = set(recording.roles.values())
-    for event in recording.events():
-        found.setdefault((type(event), event.topic), event)
-        missing.discard(event.topic)
-        if not missing:
-            break
-    return tuple(found.values())
+        for event in islice(self._recording.events(), _SCAN_EVENTS):
+            if event.topic == topic and isinstance(event, RawEvent) and (size := event.decoded_size()) is not None:
+                return size
+        return None
 
 
 def _by_kind(firsts: Iterable[Event]) -> dict[type[Event], Event]:
@@ -145,14 +135,6 @@ def _by_kind(firsts: Iterable[Event]) -> dict[type[Event], Event]:
     for event in firsts:
         found.setdefault(type(event), event)
     return found
-
-
-def first_size(events: Iterable[Event]) -> tuple[int, int] | None:
-    """Width and height of the first image among events that can be decoded."""
-    for event in events:
-        if isinstance(event, RawEvent) and (size := event.decoded_size()) is not None:
-            return size
-    return None
 
 
 # --- Sensors, by the facts --------------------------------------------------------------------------------------------
@@ -267,10 +249,9 @@ def sensor_setup(facts: StreamFacts, landmark_map: LandmarkMap | None, config: C
         )
     detector = configured_detector(config, landmark_map) if "image" in kinds else None
     imu_up = T_base_imu = None
-    learned = learned_motion(config, lambda: mounted_up(facts, config, facts.first))
+    learned = learned_motion(config, lambda: mounted_up(facts, config))
     if "imu" in facts.roles and config.gyro.use:
-        imu_up = mounted_up(facts, config, facts.first)
-        T_base_imu = mounted_imu(facts, config, facts.first)
+        imu_up, T_base_imu = mounted_up(facts, config), _mounted_imu(facts, config)
     sees = bool(sensors) or not {"image", "sightings"}.isdisjoint(kinds)
     beside = tuple(BesideOdometry(one, config.gate, _frames(facts, config)) for one in there)
     return SensorSetup(
@@ -338,7 +319,7 @@ def _frames(facts: StreamFacts, config: Config) -> Callable[[str], FloatArray | 
     """Function from the name of a frame to ``T_base_frame (4, 4)``; None: tf has no such frame."""
 
     def frame(name: str) -> FloatArray | None:
-        base = base_frame(facts, config, facts.first)
+        base = base_frame(facts, config)
         if name.lstrip("/") == base.lstrip("/"):
             return np.eye(4)
         return facts.frames.lookup(base, name) if name in facts.frames and base in facts.frames else None
@@ -366,17 +347,17 @@ def resolved(config: Config, given_map: Path | LandmarkMap | None) -> Config:
     """The configuration a run uses: without a map landmarks are variables, which the fixed lag would forget."""
     if given_map is not None or config.estimator.kind != "fixed_lag":
         return config
-    return config.model_copy(update={"estimator": config.estimator.model_copy(update={"kind": "isam2"})})
+    return with_values(config, "estimator", {"kind": "isam2"})
 
 
-def base_frame(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> str:
+def base_frame(facts: StreamFacts, config: Config) -> str:
     """Name of the robot's base frame: as configured, a usual one among the transforms, or the odometry's child."""
     if config.recording.base_frame is not None:
         return config.recording.base_frame
     for name in BASE_NAMES:
-        if name in stream.frames:
+        if name in facts.frames:
             return name
-    named = (event.base_frame_id for event in first.values() if isinstance(event, MotionEvent))
+    named = (event.base_frame_id for event in facts.first.values() if isinstance(event, MotionEvent))
     return next(filter(None, named), BASE_NAMES[0])
 
 
@@ -449,7 +430,7 @@ def _camera(facts: StreamFacts, config: Config) -> Camera:
     info, frame = first.get(CameraInfoEvent), camera_frame(first)
     T_base_cam = given_pose(config, default_axes="optical")
     if T_base_cam is None:
-        T_base_cam = facts.frames.lookup(base_frame(facts, config, first), frame)
+        T_base_cam = facts.frames.lookup(base_frame(facts, config), frame)
     if config.camera.file is not None:
         camera = load_camera(config.camera.file, T_base_cam)
     elif isinstance(info, CameraInfoEvent):
@@ -475,33 +456,31 @@ def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
     return corrected(rescaled(camera, *size), config.camera)
 
 
-def mounted_imu(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> FloatArray:
+def _mounted_imu(facts: StreamFacts, config: Config) -> FloatArray:
     """``T_base_imu (4, 4)``; without a transform the IMU is taken to be level and at the base."""
     if config.recording.imu_pose is not None:
         x, y, z, roll, pitch, yaw = config.recording.imu_pose
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rpy_matrix(roll, pitch, yaw), (x, y, z)
-        return T
-    base = base_frame(stream, config, first)
-    event = next((e for e in first.values() if isinstance(e, InertialEvent)), None)
-    if event is not None and event.frame_id in stream.frames and base in stream.frames:
-        return np.asarray(stream.frames.lookup(base, event.frame_id))
+        return homogeneous(rpy_matrix(roll, pitch, yaw), (x, y, z))
+    base = base_frame(facts, config)
+    event = next((e for e in facts.first.values() if isinstance(e, InertialEvent)), None)
+    if event is not None and event.frame_id in facts.frames and base in facts.frames:
+        return facts.frames.lookup(base, event.frame_id)
     return np.eye(4)
 
 
-def mounted_up(stream: HasFrames, config: Config, first: Mapping[type[Event], Event]) -> FloatArray:
+def mounted_up(facts: StreamFacts, config: Config) -> FloatArray:
     """The base's z axis in the IMU's frame ``(3,)``; without a transform the IMU is taken to be mounted level.
 
     Its length is ``gyro.scale``, so that rates along it are true ones.
     """
-    return np.asarray(config.gyro.scale * mounted_imu(stream, config, first)[2, :3])
+    return np.asarray(config.gyro.scale * _mounted_imu(facts, config)[2, :3])
 
 
 def base_up(recording: Recording, config: Config) -> FloatArray | None:
     """`mounted_up` of a recording's gyro; None: there is none, or it is not to be used."""
     if "imu" not in recording.roles or not config.gyro.use:
         return None
-    return mounted_up(recording, config, first_events(recording))
+    return mounted_up(RecordingFacts(recording), config)
 
 
 def given_pose(config: Config, default_axes: str) -> FloatArray | None:
@@ -509,22 +488,18 @@ def given_pose(config: Config, default_axes: str) -> FloatArray | None:
     if config.recording.sightings_pose is None:
         return None
     x, y, z, roll, pitch, yaw = config.recording.sightings_pose
-    T = np.eye(4)
-    T[:3, :3] = rpy_matrix(roll, pitch, yaw)
-    if (config.recording.sightings_axes or default_axes) == "optical":
-        T[:3, :3] = T[:3, :3] @ OPTICAL_TO_BODY
-    T[:3, 3] = x, y, z
-    return T
+    optical = (config.recording.sightings_axes or default_axes) == "optical"
+    rotation = rpy_matrix(roll, pitch, yaw)
+    return homogeneous(rotation @ OPTICAL_TO_BODY if optical else rotation, (x, y, z))
 
 
 def _sensor_pose(facts: StreamFacts, config: Config, notes: list[str]) -> FloatArray | None:
     """Place of a sensor that reports ranges or marker poses: as configured, or from tf, or at the base."""
     given = given_pose(config, default_axes="body")
-    first = facts.first
-    event = next((e for e in first.values() if isinstance(e, SightingsEvent) and not e.in_pixels), None)
+    event = next((e for e in facts.first.values() if isinstance(e, SightingsEvent) and not e.in_pixels), None)
     if given is not None or event is None:
         return given
-    base = base_frame(facts, config, first)
+    base = base_frame(facts, config)
     T = np.eye(4)
     if event.frame_id in facts.frames and base in facts.frames:
         T = facts.frames.lookup(base, event.frame_id).copy()

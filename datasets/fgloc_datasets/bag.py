@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -13,11 +12,13 @@ from numpy.typing import ArrayLike
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from fgloc.recording.messages import default_typestore
+from fgloc.recording.messages import Messages, default_typestore
+from fgloc.recording.standard_messages import Message, header, rotation, xyz
 
 # --- Messages ---------------------------------------------------------------------------------------------------------
 
 Tap = Callable[[str, str, Any, int], None]
+_LONGEST_RANGE_M = 82.0  # of a laser scanner
 
 
 class MessageWriter:
@@ -46,6 +47,7 @@ class MessageWriter:
             path.rmdir()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = default_typestore()
+        self._messages = Messages(self._store)
         plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
         self._writer = Writer(path, version=9, storage_plugin=plugin)
         if compress:
@@ -70,64 +72,38 @@ class MessageWriter:
 
     def write(self, topic: str, message_type: str, message: Any, received_ns: int) -> None:
         """Write any message of the typestore."""
-        raw = self._store.serialize_cdr(message, message_type)
-        self._writer.write(self._connection(topic, message_type), received_ns, raw)
-        if self._tap is not None:
-            self._tap(topic, message_type, self._store.deserialize_cdr(raw, message_type), received_ns)
+        self._send(topic, message_type, bytes(self._store.serialize_cdr(message, message_type)), received_ns)
 
     def make(self, message_type: str, **fields: Any) -> Any:
         """A message of the typestore, for `write`."""
-        return self._make(message_type, **fields)
+        return self._store.types[message_type](**fields)
 
-    # --- parts of messages ---
+    def _write(
+        self, topic: str, kind: str, stamp_ns: int, received_ns: int | None, frame_id: str, content: Message
+    ) -> None:
+        """Write a message with a header, given as `Messages.encode` has it."""
+        raw = self._messages.encode(kind, {"header": header(stamp_ns, frame_id), **content})
+        self._send(topic, kind, raw, stamp_ns if received_ns is None else received_ns)
+
+    def _send(self, topic: str, message_type: str, raw: bytes, received_ns: int) -> None:
+        self.copy(topic, message_type, raw, received_ns)
+        if self._tap is not None:
+            self._tap(topic, message_type, self._messages.decode(message_type, raw), received_ns)
 
     def _connection(self, topic: str, message_type: str) -> Connection:
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(topic, message_type, typestore=self._store)
         return self._connections[topic]
 
-    def _make(self, message_type: str, **fields: Any) -> Any:
-        return self._store.types[message_type](**fields)
 
-    def _write(
-        self, topic: str, kind: str, stamp_ns: int, received_ns: int | None, frame_id: str, content: dict[str, Any]
-    ) -> None:
-        message = self._make(kind, header=self._header(stamp_ns, frame_id), **content)
-        self.write(topic, kind, message, stamp_ns if received_ns is None else received_ns)
-
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-        time = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        return self._make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
-
-    def _vector(self, xyz: Sequence[float]) -> Any:
-        return self._make("geometry_msgs/msg/Vector3", **xyz_fields(xyz))
-
-    def _quaternion(self, xyzw: Sequence[float]) -> Any:
-        x, y, z, w = (float(value) for value in xyzw)
-        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-    def _twist(self, linear: Sequence[float], angular: Sequence[float]) -> Any:
-        return self._make("geometry_msgs/msg/Twist", linear=self._vector(linear), angular=self._vector(angular))
-
-    def _planar_pose(self, pose: Sequence[float]) -> Any:
-        x, y, yaw = pose
-        return self._make(
-            "geometry_msgs/msg/Pose",
-            position=self._make("geometry_msgs/msg/Point", **xyz_fields((x, y, 0.0))),
-            orientation=self._quaternion((0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))),
-        )
-
-
-def xyz_fields(values: Sequence[float]) -> dict[str, float]:
-    """Fields x, y, z of a message's vector or point."""
-    x, y, z = (float(value) for value in values)
-    return {"x": x, "y": y, "z": z}
+def quaternion_fields(xyzw: Sequence[float]) -> Message:
+    """geometry_msgs/Quaternion of x, y, z, w."""
+    return dict(zip("xyzw", map(float, xyzw), strict=True))
 
 
 def flat_cov(cov: ArrayLike | None) -> Any:
-    """Covariance ``(6, 6)`` as an array ``(36,)`` of a message; zeros for None."""
-    return np.zeros(36) if cov is None else np.asarray(cov, dtype=float).reshape(36)
+    """Covariance ``(6, 6)`` as an array ``(36,)`` of a message; None, for which a message has zeros, as it is."""
+    return None if cov is None else np.asarray(cov, dtype=float).reshape(36)
 
 
 # --- Landmarks --------------------------------------------------------------------------------------------------------
@@ -140,7 +116,7 @@ class LandmarkMessages(MessageWriter):
         self, topic: str, stamp_ns: int, range_m: float, frame_id: str, received_ns: int | None = None
     ) -> None:
         """``sensor_msgs/Range`` of a radio, of 0.1 to 100 m."""
-        content = dict(radiation_type=2, field_of_view=0.0, min_range=0.1, max_range=100.0, range=range_m)
+        content = dict(radiation_type=2, min_range=0.1, max_range=100.0, range=range_m)
         self._write(topic, "sensor_msgs/msg/Range", stamp_ns, received_ns, frame_id, content)
 
     def laser_scan(
@@ -150,25 +126,19 @@ class LandmarkMessages(MessageWriter):
         ranges: ArrayLike,
         intensities: ArrayLike,
         bearings: tuple[float, float],
-        received_ns: int | None = None,
-        frame_id: str = "laser",
         beam_s: float = 0.0,
-        max_range: float = 82.0,
     ) -> None:
         """``sensor_msgs/LaserScan``: ranges [m] and intensities ``(n,)``, bearings of the first and the last beam."""
-        measured = np.asarray(ranges, dtype=np.float32)
         content = dict(
             angle_min=bearings[0],
             angle_max=bearings[1],
-            angle_increment=(bearings[1] - bearings[0]) / max(len(measured) - 1, 1),
+            angle_increment=(bearings[1] - bearings[0]) / max(np.size(ranges) - 1, 1),
             time_increment=beam_s,
-            scan_time=0.0,
-            range_min=0.0,
-            range_max=max_range,
-            ranges=measured,
-            intensities=np.asarray(intensities, dtype=np.float32),
+            range_max=_LONGEST_RANGE_M,
+            ranges=ranges,
+            intensities=intensities,
         )
-        self._write(topic, "sensor_msgs/msg/LaserScan", stamp_ns, received_ns, frame_id, content)
+        self._write(topic, "sensor_msgs/msg/LaserScan", stamp_ns, None, "laser", content)
 
     def satellite_fix(
         self,
@@ -182,11 +152,11 @@ class LandmarkMessages(MessageWriter):
         """``sensor_msgs/NavSatFix``: latitude, longitude [degrees], altitude [m]; variances east, north, up [m²]."""
         latitude, longitude, altitude = place
         content = dict(
-            status=self._make("sensor_msgs/msg/NavSatStatus", status=2, service=1),
+            status={"status": 2, "service": 1},
             latitude=float(latitude),
             longitude=float(longitude),
             altitude=float(altitude),
-            position_covariance=np.diag(np.asarray(variances, dtype=float)).ravel(),
+            position_covariance=np.diag(variances).ravel(),
             position_covariance_type=2,
         )
         self._write(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, received_ns, frame_id, content)
@@ -200,20 +170,9 @@ class LandmarkMessages(MessageWriter):
         frame_id: str = "base_link",
     ) -> None:
         """``landmark_msgs/LandmarkArray`` of (id, range [m], bearing [rad])."""
-        landmarks = [
-            self._make(
-                "landmark_msgs/msg/Landmark",
-                id=i,
-                hamming=0,
-                goodness=1.0,
-                decision_margin=1.0,
-                range=r,
-                bearing=b,
-            )
-            for i, r, b in sightings
-        ]
-        content = dict(landmarks=landmarks)
-        self._write(topic, "landmark_msgs/msg/LandmarkArray", stamp_ns, received_ns, frame_id, content)
+        landmarks = [dict(id=i, goodness=1.0, decision_margin=1.0, range=r, bearing=b) for i, r, b in sightings]
+        kind = "landmark_msgs/msg/LandmarkArray"
+        self._write(topic, kind, stamp_ns, received_ns, frame_id, dict(landmarks=landmarks))
 
     def marker_poses(
         self,
@@ -224,24 +183,11 @@ class LandmarkMessages(MessageWriter):
         frame_id: str = "camera_optical",
     ) -> None:
         """``aruco_msgs/MarkerArray`` of (id, position, quaternion x, y, z, w, covariance (6, 6) or None)."""
-        markers = [
-            self._make(
-                "aruco_msgs/msg/Marker",
-                header=self._header(stamp_ns, frame_id),
-                id=number,
-                pose=self._make(
-                    "geometry_msgs/msg/PoseWithCovariance",
-                    pose=self._make(
-                        "geometry_msgs/msg/Pose",
-                        position=self._make("geometry_msgs/msg/Point", **xyz_fields(position)),
-                        orientation=self._quaternion(quaternion),
-                    ),
-                    covariance=flat_cov(cov),
-                ),
-                confidence=1.0,
-            )
-            for number, position, quaternion, cov in sightings
-        ]
+        markers = []
+        for number, position, quaternion, cov in sightings:
+            pose = {"position": xyz(*position), "orientation": quaternion_fields(quaternion)}
+            measured = {"pose": pose, "covariance": flat_cov(cov)}
+            markers.append(dict(header=header(stamp_ns, frame_id), id=number, pose=measured, confidence=1.0))
         self._write(topic, "aruco_msgs/msg/MarkerArray", stamp_ns, received_ns, frame_id, dict(markers=markers))
 
     def corners(
@@ -259,22 +205,8 @@ class LandmarkMessages(MessageWriter):
         detections = []
         for number, given in markers.items():
             corners = np.asarray(given, dtype=float)[[1, 0, 3, 2]] + 0.5
-            points = [self._make("apriltag_msgs/msg/Point", x=float(x), y=float(y)) for x, y in corners]
-            x, y = corners.mean(axis=0).tolist()
-            centre = self._make("apriltag_msgs/msg/Point", x=x, y=y)
-            detections.append(
-                self._make(
-                    "apriltag_msgs/msg/AprilTagDetection",
-                    family="",
-                    id=number,
-                    hamming=0,
-                    goodness=0.0,
-                    decision_margin=100.0,
-                    centre=centre,
-                    corners=points,
-                    homography=np.zeros(9),
-                )
-            )
+            centre, *points = (dict(x=float(x), y=float(y)) for x, y in [corners.mean(axis=0), *corners])
+            detections.append(dict(id=number, decision_margin=100.0, centre=centre, corners=points))
         kind = "apriltag_msgs/msg/AprilTagDetectionArray"
         self._write(topic, kind, stamp_ns, received_ns, frame_id, dict(detections=detections))
 
@@ -301,17 +233,15 @@ class BagWriter(LandmarkMessages):
         vy: float = 0.0,
     ) -> None:
         """``geometry_msgs/TwistStamped``: v [m/s], omega [rad/s], vy [m/s] to the left."""
-        twist = self._twist([v, vy, 0.0], [0.0, 0.0, omega])
+        twist = {"linear": xyz(v, vy), "angular": xyz(z=omega)}
         self._write(topic, "geometry_msgs/msg/TwistStamped", stamp_ns, received_ns, frame_id, dict(twist=twist))
 
     def ackermann(
         self, topic: str, stamp_ns: int, speed: float, steering: float, received_ns: int | None = None
     ) -> None:
         """``ackermann_msgs/AckermannDriveStamped``: speed [m/s] and steering angle [rad]."""
-        fields = dict(steering_angle=steering, steering_angle_velocity=0.0, speed=speed, acceleration=0.0, jerk=0.0)
-        drive = self._make("ackermann_msgs/msg/AckermannDrive", **fields)
-        kind = "ackermann_msgs/msg/AckermannDriveStamped"
-        self._write(topic, kind, stamp_ns, received_ns, "base_link", dict(drive=drive))
+        content = dict(drive={"steering_angle": steering, "speed": speed})
+        self._write(topic, "ackermann_msgs/msg/AckermannDriveStamped", stamp_ns, received_ns, "base_link", content)
 
     def odometry(
         self,
@@ -336,16 +266,12 @@ class BagWriter(LandmarkMessages):
         """
         pose_cov, twist_cov = covs
         frame_id, child_frame_id = frames
+        x, y, yaw = pose
+        moved = {"linear": xyz(twist[0], twist[1] if len(twist) > 2 else 0.0), "angular": xyz(z=twist[-1])}
         content = dict(
             child_frame_id=child_frame_id,
-            pose=self._make(
-                "geometry_msgs/msg/PoseWithCovariance", pose=self._planar_pose(pose), covariance=flat_cov(pose_cov)
-            ),
-            twist=self._make(
-                "geometry_msgs/msg/TwistWithCovariance",
-                twist=self._twist([twist[0], twist[1] if len(twist) > 2 else 0.0, 0.0], [0.0, 0.0, twist[-1]]),
-                covariance=flat_cov(twist_cov),
-            ),
+            pose={"pose": {"position": xyz(x, y), "orientation": rotation(yaw)}, "covariance": flat_cov(pose_cov)},
+            twist={"twist": moved, "covariance": flat_cov(twist_cov)},
         )
         self._write(topic, "nav_msgs/msg/Odometry", stamp_ns, received_ns, frame_id, content)
 
@@ -360,12 +286,7 @@ class BagWriter(LandmarkMessages):
         received_ns: int | None = None,
     ) -> None:
         """``sensor_msgs/JointState``: rad, rad/s, Nm; an empty sequence is left empty."""
-        content = dict(
-            name=list(names),
-            position=np.asarray(position, dtype=float),
-            velocity=np.asarray(velocity, dtype=float),
-            effort=np.asarray(effort, dtype=float),
-        )
+        content = dict(name=names, position=position, velocity=velocity, effort=effort)
         self._write(topic, "sensor_msgs/msg/JointState", stamp_ns, received_ns, "", content)
 
     def imu(
@@ -382,14 +303,12 @@ class BagWriter(LandmarkMessages):
 
         ``variances`` are of angular velocity and linear acceleration, each axis.
         """
-        no_orientation = np.zeros(9)
-        no_orientation[0] = -1.0
         content = dict(
-            orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-            orientation_covariance=no_orientation,
-            angular_velocity=self._vector(angular_velocity),
+            orientation={"w": 1.0},
+            orientation_covariance=np.append(-1.0, np.zeros(8)),
+            angular_velocity=xyz(*angular_velocity),
             angular_velocity_covariance=np.eye(3).ravel() * variances[0],
-            linear_acceleration=self._vector(linear_acceleration),
+            linear_acceleration=xyz(*linear_acceleration),
             linear_acceleration_covariance=np.eye(3).ravel() * variances[1],
         )
         self._write(topic, "sensor_msgs/msg/Imu", stamp_ns, received_ns, frame_id, content)
@@ -425,15 +344,10 @@ class BagWriter(LandmarkMessages):
             height=size[1],
             width=size[0],
             distortion_model="plumb_bob",
-            d=np.asarray(D, dtype=float),
+            d=D,
             k=matrix.ravel(),
             r=np.eye(3).ravel(),
             p=projection.ravel(),
-            binning_x=0,
-            binning_y=0,
-            roi=self._make(
-                "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-            ),
         )
         self._write(topic, "sensor_msgs/msg/CameraInfo", stamp_ns, received_ns, frame_id, content)
 
@@ -448,19 +362,10 @@ class BagWriter(LandmarkMessages):
         topic: str = "/tf_static",
     ) -> None:
         """``tf2_msgs/TFMessage`` with one transform ``T_parent_child``; quaternion x, y, z, w."""
-        transform = self._make(
-            "geometry_msgs/msg/Transform",
-            translation=self._vector(translation),
-            rotation=self._quaternion(quaternion),
-        )
-        stamped = self._make(
-            "geometry_msgs/msg/TransformStamped",
-            header=self._header(stamp_ns, parent),
-            child_frame_id=child,
-            transform=transform,
-        )
-        message = self._make("tf2_msgs/msg/TFMessage", transforms=[stamped])
-        self.write(topic, "tf2_msgs/msg/TFMessage", message, stamp_ns if received_ns is None else received_ns)
+        transform = {"translation": xyz(*translation), "rotation": quaternion_fields(quaternion)}
+        stamped = {"header": header(stamp_ns, parent), "child_frame_id": child, "transform": transform}
+        raw = self._messages.encode("tf2_msgs/msg/TFMessage", {"transforms": [stamped]})
+        self._send(topic, "tf2_msgs/msg/TFMessage", raw, stamp_ns if received_ns is None else received_ns)
 
     def truth(
         self,
@@ -472,11 +377,7 @@ class BagWriter(LandmarkMessages):
         frame_id: str = "map",
     ) -> None:
         """``geometry_msgs/PoseStamped``; quaternion x, y, z, w."""
-        pose = self._make(
-            "geometry_msgs/msg/Pose",
-            position=self._make("geometry_msgs/msg/Point", **xyz_fields(position)),
-            orientation=self._quaternion(quaternion),
-        )
+        pose = {"position": xyz(*position), "orientation": quaternion_fields(quaternion)}
         self._write(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, received_ns, frame_id, dict(pose=pose))
 
     def twist(
@@ -486,22 +387,16 @@ class BagWriter(LandmarkMessages):
         linear: Sequence[float],
         angular: Sequence[float],
         received_ns: int | None = None,
-        frame_id: str = "base_link",
     ) -> None:
         """``geometry_msgs/TwistWithCovarianceStamped`` (which nothing takes for a command), covariance zero."""
-        content = self._make(
-            "geometry_msgs/msg/TwistWithCovariance", twist=self._twist(linear, angular), covariance=np.zeros(36)
-        )
+        content = dict(twist={"twist": {"linear": xyz(*linear), "angular": xyz(*angular)}})
         kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
-        self._write(topic, kind, stamp_ns, received_ns, frame_id, dict(twist=content))
+        self._write(topic, kind, stamp_ns, received_ns, "base_link", content)
 
     def flag(self, topic: str, value: bool, received_ns: int) -> None:
         """``std_msgs/Bool``, which has no stamp."""
-        self.write(topic, "std_msgs/msg/Bool", self._make("std_msgs/msg/Bool", data=value), received_ns)
+        self._send(topic, "std_msgs/msg/Bool", self._messages.encode("std_msgs/msg/Bool", {"data": value}), received_ns)
 
-    def illuminance(
-        self, topic: str, stamp_ns: int, lux: float, received_ns: int | None = None, frame_id: str = "map"
-    ) -> None:
+    def illuminance(self, topic: str, stamp_ns: int, lux: float, received_ns: int | None = None) -> None:
         """``sensor_msgs/Illuminance``."""
-        content = dict(illuminance=lux, variance=0.0)
-        self._write(topic, "sensor_msgs/msg/Illuminance", stamp_ns, received_ns, frame_id, content)
+        self._write(topic, "sensor_msgs/msg/Illuminance", stamp_ns, received_ns, "map", dict(illuminance=lux))

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize, nnls
 
 from fgloc import se2
+from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError
 from fgloc.frames import yaw_quaternion
 from fgloc.sensors.maps import write_map
@@ -202,7 +203,7 @@ def frames(run: Run) -> Iterator[slice]:
 
 def robot_settings(c: Calibration) -> dict[str, Any]:
     """Content of ``robot.yaml``."""
-    noise = {name: getattr(c, name) for name in Calibration.__dataclass_fields__ if "_per_sqrt_" in name}
+    noise = {name: getattr(c, name) for name in _DENSITIES}
     return {
         "recording": {
             "topics": {"command": "/cmd_vel", "sightings": "/landmarks", "truth": "/truth"},
@@ -292,15 +293,7 @@ _TRUTH_GAP_S = 0.2
 _FIT_WINDOW_S, _FIT_STRIDE_S = 2.0, 0.5
 _NOISE_WINDOW_S, _NOISE_STRIDE_S = 5.0, 2.5  # about the time between two fixes
 _GROSS_RANGE_M, _GROSS_BEARING_RAD = 1.0, 0.15
-_DENSITIES = (
-    "x_per_sqrt_m",
-    "y_per_sqrt_m",
-    "yaw_per_sqrt_m",
-    "xy_per_sqrt_rad",
-    "yaw_per_sqrt_rad",
-    "xy_per_sqrt_s",
-    "yaw_per_sqrt_s",
-)
+_DENSITIES = tuple(NoiseDensity.model_fields)
 _LEAST_DENSITY = np.array([0, 0, 0, 0, 0, 0.001, 0.002])  # at rest: the logs hardly show any, a bump would
 _RESPONSE = ("scale_v", "scale_omega", "delay_s", "yaw_per_m")
 _SENSOR = ("range_scale", "camera_x", "bearing_bias_rad", "latency_s")
@@ -343,9 +336,8 @@ def _all_errors(run: Run, sensor: FloatArray) -> FloatArray:
     at = run.sightings_ns - int(latency * 1e9)
     pose = se2.interpolate(run.truth_ns, run.truth, at)
     landmark = np.array([run.landmarks[int(i)] for i in run.subjects])
-    d = landmark - pose[:, :2]
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    x, y = c * d[:, 0] + s * d[:, 1] - camera_x, c * d[:, 1] - s * d[:, 0]
+    x, y = se2.turned(landmark - pose[:, :2], -pose[:, 2]).T
+    x = x - camera_x
     bearing = run.sightings[:, 1] - bias
     range_error = run.sightings[:, 0] * scale / np.cos(bearing) - np.hypot(x, y)
     return np.column_stack([range_error, se2.wrap_array(bearing - np.arctan2(y, x)), np.hypot(x, y)])
@@ -414,10 +406,7 @@ class _Drive:
         poses = self._integrate(response)[0]
         begin, end = self._windows(window_s, stride_s)
         predicted, true = _relative(poses, begin, end), _relative(self._truth, begin, end)
-        d = true - predicted
-        c, s = np.cos(predicted[:, 2]), np.sin(predicted[:, 2])
-        error = np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], se2.wrap_array(d[:, 2])])
-        return error, begin, end
+        return se2.between_array(predicted, true), begin, end
 
     def noise_samples(self, response: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors ``(n, 3)`` and, for each density, the covariance that its unit gives each window ``(7, n, 3, 3)``."""
@@ -487,8 +476,7 @@ def _has_truth(truth_ns: IntArray, at_ns: IntArray) -> NDArray[np.bool_]:
 def _relative(poses: FloatArray, begin: IntArray, end: IntArray) -> FloatArray:
     """Motions ``(n, 3)`` between poses whose yaw is not wrapped."""
     d = poses[end] - poses[begin]
-    c, s = np.cos(poses[begin, 2]), np.sin(poses[begin, 2])
-    return np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]])
+    return np.column_stack([se2.turned(d[:, :2], -poses[begin, 2]), d[:, 2]])
 
 
 def _densities(errors: FloatArray, basis: FloatArray) -> FloatArray:

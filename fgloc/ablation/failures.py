@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import reduce
 from operator import or_
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -275,7 +275,20 @@ class MovedMarker(Failure):
 # --- The robot is carried away: a piece of the recording is cut out ---------------------------------------------------
 
 
-class Kidnap(Failure):
+class _Pieces(Failure):
+    """A failure of whole pieces of a recording, each with a beginning and an end; one at random without ``when``."""
+
+    why: ClassVar[str]  # it needs them
+    when: When = When(bursts=1)
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if self.when.share != 1.0 or not (self.when.intervals or self.when.bursts):
+            raise ValueError(f"{self.why}: give 'when' intervals or bursts, and no share")
+        return self
+
+
+class Kidnap(_Pieces):
     """What was measured inside each interval is cut out, for all sensors and the truth, and the gap is closed.
 
     The robot goes on from where it was at the interval's end, although its odometry and wheel angles, moved to join on
@@ -285,13 +298,7 @@ class Kidnap(Failure):
     """
 
     kind: Literal["kidnap"] = "kidnap"
-    when: When = When(bursts=1)
-
-    @model_validator(mode="after")
-    def _bounded(self) -> Kidnap:
-        if self.when.share != 1.0 or not (self.when.intervals or self.when.bursts):
-            raise ValueError("kidnap cuts whole pieces out: give 'when' intervals or bursts, and no share")
-        return self
+    why: ClassVar[str] = "kidnap cuts whole pieces out"
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The events that are left, in order of receipt."""
@@ -343,7 +350,7 @@ def _removed(cuts: list[tuple[int, int]], at: int) -> int | None:
 # --- The robot is carried while the recording goes on -----------------------------------------------------------------
 
 
-class Lift(Failure):
+class Lift(_Pieces):
     """Inside each interval the robot is lifted, carried along the way that the recording drives, and set down.
 
     No time is cut out (`Kidnap` does that), and the truth stays: it is carried where it went, turning as it did.
@@ -354,18 +361,12 @@ class Lift(Failure):
     """
 
     kind: Literal["lift"] = "lift"
-    when: When = When(bursts=1)
+    why: ClassVar[str] = "lift needs a beginning and an end"
     wheels: Literal["still", "spin"] = "still"
     spin_m_s: float = Field(0.3, description="m/s, of the rims")
     markers: Literal["hidden", "shown"] = "hidden"
     height_m: float = Field(0.5, gt=0, description="m")
     rise_s: float = Field(1.0, gt=0, description="s")
-
-    @model_validator(mode="after")
-    def _bounded(self) -> Lift:
-        if self.when.share != 1.0 or not (self.when.intervals or self.when.bursts):
-            raise ValueError("lift needs a beginning and an end: give 'when' intervals or bursts, and no share")
-        return self
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The events, in order of receipt."""

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -25,13 +26,14 @@ from fgloc.ablation.failures import corrupt, generators
 from fgloc.ablation.suite import Cell
 from fgloc.config import Config, files_of
 from fgloc.errors import FglocError, OutputError, RecordingError
-from fgloc.evaluation.metrics import Metrics, compute_metrics, match_result
+from fgloc.evaluation.metrics import compute_metrics, match_result
 from fgloc.evaluation.report import write_results
 from fgloc.files.outputs import sha256_of, write_json, write_text
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import base_pose
 from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
+from fgloc.sensors.base import with_values
 from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
 from fgloc.sensors.markers.images import ImageError, ImageEvent
@@ -41,29 +43,29 @@ from fgloc.types import Mode, TruthEvent
 # --- Records, written whole or not at all, and a line for every attempt -----------------------------------------------
 
 
-class Track(BaseModel):
-    """Estimate and truth at common times, for a picture [m]."""
+class _Kept(BaseModel):
+    """Contents of a file, or a part of them: unknown keys are errors, values are immutable."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Track(_Kept):
+    """Estimate and truth at common times, for a picture [m]."""
 
     estimate: list[tuple[float, float]]
     truth: list[tuple[float, float]]
 
 
-class Cost(BaseModel):
+class Cost(_Kept):
     """Wall time, CPU time and peak memory of one run; never the same twice."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seconds: float
     cpu_s: float
     peak_mb: float
 
 
-class Record(BaseModel):
+class Record(_Kept):
     """Result of a job's run. All fields but ``cost`` depend on the inputs alone."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     key: str
     outcome: Literal["done", "refused", "crashed"]
@@ -89,9 +91,8 @@ def owner_path(out: Path, folder: str) -> Path:
 
 def read_record(out: Path, key: str) -> Record | None:
     """A job's record; None if it has none, or if its file is damaged: then the job has to run again."""
-    path = record_path(out, key)
     try:
-        return Record.model_validate_json(path.read_bytes())
+        return Record.model_validate_json(record_path(out, key).read_bytes())
     except (FileNotFoundError, ValidationError):
         return None
 
@@ -157,10 +158,8 @@ _SOURCES_LEFT_OUT = (
 _COSTS = {"real_time_factor", "step_ms"}
 
 
-class Job(BaseModel):
+class Job(_Kept):
     """A cell and the hash of everything that its result depends on."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     key: str
     cell: Cell
@@ -169,14 +168,14 @@ class Job(BaseModel):
     command: str = ""  # for those files
 
 
-def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, command: str = "") -> list[Job]:
+def make_jobs(cells: Sequence[Cell], in_folders: bool = False, command: str = "") -> list[Job]:
     """Name each cell by the SHA-256 of recording, map, model, configuration, failures, seed and code.
 
     Two cells with the same inputs get the same key, and run once.
 
     Args:
         cells: from `expand`.
-        folders: recording -> folder for all files of its run; None: figures alone are kept.
+        in_folders: all files of a run are kept, in a folder of its recording's name; else figures alone.
         command: what the user typed, for those files.
     """
     hashes: dict[Path, str] = {}
@@ -206,7 +205,7 @@ def make_jobs(cells: Sequence[Cell], folders: Mapping[str, str] | None = None, c
         seen = {name: inputs[name] for name in ("bag", "map", "code")} | {"dictionary": cell.config.markers.dictionary}
         if any(failure.pixels for failure in cell.chain):
             seen |= {name: inputs[name] for name in ("chain", "seed")}
-        folder = None if folders is None else folders[cell.recording]
+        folder = cell.recording if in_folders else None
         if folder is not None:
             inputs["folder"] = folder
         jobs.append(Job(key=_hash(inputs), cell=cell, images=_hash(seen), folder=folder, command=command))
@@ -317,8 +316,7 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
             if corrupted is not landmark_map:
                 map_file = Path(folder) / "map.yaml"
                 write_map(corrupted, map_file)
-                metres = config.map.model_copy(update={"scale": 1.0, "size_scale": 1.0})
-                config = config.model_copy(update={"map": metres})
+                config = with_values(config, "map", {"scale": 1.0, "size_scale": 1.0})  # it is in metres
         result = run(
             cell.bag,
             map_file,
@@ -335,12 +333,11 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
         owner.unlink(missing_ok=True)  # the files may be those of a run with other settings
         write_results(result, config, out / job.folder, job.command, sha256_of(cell.bag))
         write_text(owner, job.key)
-    affected: dict[str, int] = {}
+    affected: Counter[str] = Counter()
     for scene in scenes:
-        for kind, n in scene.affected.items():
-            affected[kind] = affected.get(kind, 0) + n
+        affected.update(scene.affected)
     return {
-        "figures": _figures(metrics),
+        "figures": metrics.model_dump(mode="json", exclude=_COSTS),
         "modes": {mode.value: sum(m is mode for m in result.modes) / len(result.modes) for mode in Mode},
         "mistakes": result.mistakes,
         "sensors": sensors,
@@ -354,10 +351,6 @@ def _sensors(recording: Recording) -> tuple[str, ...]:
     roles = [topic.role for topic in recording.topics if topic.role is not None and topic.count]
     heard = {stream.event for role in roles for stream in streams_of(role)}
     return tuple(name for name, events in events_by_sensor().items() if heard.intersection(events))
-
-
-def _figures(metrics: Metrics) -> dict[str, Any]:
-    return metrics.model_dump(mode="json", exclude=_COSTS)
 
 
 def _track(result: RunResult, config: Config) -> Track | None:
@@ -382,5 +375,4 @@ def start_at_truth(bag: Path, config: Config) -> Config:
     if first is None:
         raise RecordingError(f"{bag}: no truth to start from; use 'start: configured' and estimator.initial_pose")
     x, y, yaw = base_pose(first, config.truth).tolist()
-    estimator = config.estimator.model_copy(update={"initial_pose": (x, y, yaw)})
-    return config.model_copy(update={"estimator": estimator})
+    return with_values(config, "estimator", {"initial_pose": (x, y, yaw)})

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from scipy import stats
 
-from fgloc.ablation.jobs import Job, Record, code_hash
+from fgloc.ablation.jobs import Job, Record, Track, code_hash
 from fgloc.ablation.suite import NOTHING, Cell, Suite
 from fgloc.config import files_of
 from fgloc.evaluation.report import embedded, page
@@ -352,15 +352,6 @@ class Curves:
     curves: Mapping[str, Sequence[Entry]]
 
 
-@dataclass(frozen=True, slots=True)
-class Tracks:
-    """One small map: positions of estimate and truth [m]."""
-
-    title: str
-    estimate: Sequence[tuple[float, float]]
-    truth: Sequence[tuple[float, float]]
-
-
 def plot_failures(suite: Suite, entries: Sequence[Entry]) -> Figure:
     """Error of each failure, one below the other, by variant: mean, and every run as a dot; logarithmic."""
     shown = [(name, severity, f"{name} {_with_unit(suite, name, severity)}".rstrip()) for name, severity in rows(suite)]
@@ -440,14 +431,14 @@ def _draw_curve(axes: Axes, name: str, points: Sequence[Entry], color: str) -> N
         axes.plot(*np.array(single).T, ".", color=color, ms=3, alpha=0.6)
 
 
-def plot_tracks(plots: Sequence[Tracks]) -> Figure:
-    """Small maps side by side: the estimate over the truth, axes equal."""
-    figure, axes = _grid(len(plots), 2.2, below=0.2)
-    for ax, plot in zip(axes, plots, strict=True):
-        ax.plot(*np.array(plot.truth).T, color="#999999", lw=2.4)
-        ax.plot(*np.array(plot.estimate).T, color=BLUE, lw=1.1)
-        ax.plot(*plot.truth[0], marker="o", ms=4.5, color=GREEN, mec="white")
-        ax.set_title(plain_label(plot.title), fontsize=SMALL)
+def plot_tracks(tracks: Mapping[str, Track]) -> Figure:
+    """Small maps side by side, under their titles: the estimate over the truth, axes equal."""
+    figure, axes = _grid(len(tracks), 2.2, below=0.2)
+    for ax, (title, track) in zip(axes, tracks.items(), strict=True):
+        ax.plot(*np.array(track.truth).T, color="#999999", lw=2.4)
+        ax.plot(*np.array(track.estimate).T, color=BLUE, lw=1.1)
+        ax.plot(*track.truth[0], marker="o", ms=4.5, color=GREEN, mec="white")
+        ax.set_title(plain_label(title), fontsize=SMALL)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_xlabel("x [m]", fontsize=SMALL)
     axes[0].set_ylabel("y [m]", fontsize=SMALL)
@@ -460,7 +451,7 @@ def plot_tracks(plots: Sequence[Tracks]) -> Figure:
     return figure
 
 
-def _grid(count: int, height: float, below: float = 0.0) -> tuple[Figure, list[Axes]]:
+def _grid(count: int, height: float, below: float) -> tuple[Figure, list[Axes]]:
     columns = min(_COLUMNS, count)
     rows = math.ceil(count / columns)
     width = max(WIDTH * columns / _COLUMNS, _SINGLE_WIDTH)
@@ -473,6 +464,7 @@ def _grid(count: int, height: float, below: float = 0.0) -> tuple[Figure, list[A
 
 # --- The report -------------------------------------------------------------------------------------------------------
 
+_SHOWN = {"outcome", "error", "figures", "modes", "affected"}  # of a record, in ablation.json
 _SEVERITY = (
     f"{ATE.label} over severity. Bands are 95 % confidence intervals of the mean, "
     f"of {FEWEST_FOR_INTERVAL} runs or more; of fewer every run is a dot. "
@@ -504,6 +496,8 @@ def write_report(
     runs = join(jobs, records)
     entries = matrix(suite, runs)
     sentences = [sentence(suite, runs, failure.name) for failure in suite.failures]
+    told = [worth(suite, runs, variant.name) for variant in suite.variants[1:]]
+    worths = [text for text in told if text is not None]
     provenance: dict[str, Any] = {
         "command": command,
         "code_sha256": code_hash(),
@@ -515,9 +509,15 @@ def write_report(
     with atomic_folder(out, kept=("jobs", "detections")) as stage:
         write_text(stage / "matrix.csv", matrix_csv(entries))
         write_text(stage / "runs.csv", runs_csv(runs))
-        write_json(stage / "ablation.json", _as_json(runs, entries, sentences, _worths(suite, runs), provenance))
+        results = {
+            "sentences": sentences,
+            "variants": worths,
+            "matrix": [e.row for e in entries],
+            "runs": [run.row | run.record.model_dump(mode="json", include=_SHOWN) for run in runs],
+        }
+        write_json(stage / "ablation.json", provenance | results)
         drawn = _drawn(suite, runs, entries)
-        write_text(stage / "report.html", _page(suite, runs, entries, sentences, provenance, drawn))
+        write_text(stage / "report.html", _page(suite, runs, entries, sentences, worths, provenance, drawn))
         for form in figures:
             for name, (_, figure, _) in drawn.items():
                 (stage / f"{name}.{form}").write_bytes(image_of(figure, form))
@@ -537,11 +537,6 @@ def _drawn(suite: Suite, runs: Sequence[Run], entries: Sequence[Entry]) -> dict[
     return drawn
 
 
-def failed(jobs: Sequence[Job], records: Mapping[str, Record]) -> list[Run]:
-    """Runs that gave no result: refused for their input, or crashed and quarantined."""
-    return [run for run in join(jobs, records) if run.record.outcome != "done"]
-
-
 def _inputs(jobs: Sequence[Job]) -> dict[str, dict[str, str]]:
     """SHA-256 of every file that the runs of a recording read."""
     files: dict[str, dict[Path, None]] = {}
@@ -553,30 +548,12 @@ def _inputs(jobs: Sequence[Job]) -> dict[str, dict[str, str]]:
     return {name: {str(path): digests[path] for path in paths} for name, paths in files.items()}
 
 
-def _as_json(
-    runs: Sequence[Run],
-    entries: Sequence[Entry],
-    sentences: Sequence[str],
-    worths: Sequence[str],
-    provenance: Mapping[str, Any],
-) -> dict[str, Any]:
-    return {
-        **provenance,
-        "sentences": list(sentences),
-        "variants": list(worths),
-        "matrix": [e.row for e in entries],
-        "runs": [
-            run.row | run.record.model_dump(mode="json", include={"outcome", "error", "figures", "modes", "affected"})
-            for run in runs
-        ],
-    }
-
-
 def _page(
     suite: Suite,
     runs: Sequence[Run],
     entries: Sequence[Entry],
     sentences: Sequence[str],
+    worths: Sequence[str],
     provenance: Mapping[str, Any],
     drawn: Mapping[str, tuple[str, Figure, str]],
 ) -> str:
@@ -593,22 +570,15 @@ def _page(
         command=str(provenance["command"]),
         counts=count,
         costs=sentences,
-        worths=_worths(suite, runs),
+        worths=worths,
         matrices=[(metric.label, head, _matrix(suite, entries, metric.key)) for metric in METRICS],
         pictures=pictures,
-        bad=[(*_named(r), r.record.outcome, _last_line(r.record.error)) for r in bad],
+        bad=[
+            (c.recording, c.failure, c.variant, c.seed, r.outcome, (r.error.strip().splitlines() or [""])[-1])
+            for c, r in ((run.cell, run.record) for run in bad)
+        ],
         provenance=provenance,
     )
-
-
-def _named(run: Run) -> tuple[str, str, str, int]:
-    return run.cell.recording, run.cell.failure, run.cell.variant, run.cell.seed
-
-
-def _worths(suite: Suite, runs: Sequence[Run]) -> list[str]:
-    """A sentence for each variant but the first."""
-    told = [worth(suite, runs, variant.name) for variant in suite.variants[1:]]
-    return [text for text in told if text is not None]
 
 
 def _matrix(suite: Suite, entries: Sequence[Entry], key: str) -> list[tuple[str, ...]]:
@@ -644,16 +614,10 @@ def _curves(suite: Suite, entries: Sequence[Entry]) -> list[Curves]:
     return plots
 
 
-def _tracks(suite: Suite, runs: Sequence[Run]) -> list[Tracks]:
-    plots = []
+def _tracks(suite: Suite, runs: Sequence[Run]) -> dict[str, Track]:
+    tracks = {}
     for name in (NOTHING, *(failure.name for failure in suite.failures)):
         run = worst(suite, runs, name)
         if run is not None and run.record.track is not None:
-            title = f"{name}, {run.cell.recording}: {ATE.of(run.record):.3g} mm"
-            plots.append(Tracks(title, run.record.track.estimate, run.record.track.truth))
-    return plots
-
-
-def _last_line(error: str) -> str:
-    lines = error.strip().splitlines()
-    return lines[-1] if lines else ""
+            tracks[f"{name}, {run.cell.recording}: {ATE.of(run.record):.3g} mm"] = run.record.track
+    return tracks

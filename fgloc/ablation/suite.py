@@ -144,17 +144,17 @@ class Cell(Section):
     """One run of a suite, with all that it needs, and its place in the report."""
 
     recording: str
-    variant: str
-    failure: str
-    severity: float | None
-    seed: int
+    variant: str = ""
+    failure: str = NOTHING
+    severity: float | None = None
+    seed: int = 0
     bag: Path
     map: Path | None
-    config_file: Path | None
+    config_file: Path | None = None
     config: Config
     mode: RunMode
-    start: Literal["configured", "truth"]
-    chain: tuple[AnyFailure, ...]
+    start: Literal["configured", "truth"] = "configured"
+    chain: tuple[AnyFailure, ...] = ()
 
 
 def load_suite(path: Path) -> Suite:
@@ -201,7 +201,7 @@ def expand(suite: Suite, folder: Path) -> list[Cell]:
             mode=variant.mode or suite.mode,
             start=variant.start,
         )
-        cells.append(Cell(**common, failure=NOTHING, severity=None, seed=suite.seeds[0], chain=()))
+        cells.append(Cell(**common, seed=suite.seeds[0]))
         for failure, seed in product(suite.failures, suite.seeds):
             for severity, chain in failure.severities():
                 cells.append(Cell(**common, failure=failure.name, severity=severity, seed=seed, chain=chain))

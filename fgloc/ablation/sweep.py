@@ -24,7 +24,7 @@ from fgloc.ablation.jobs import (
     record_path,
     write_record,
 )
-from fgloc.ablation.suite import NOTHING, Cell
+from fgloc.ablation.suite import Cell
 from fgloc.config import Config
 from fgloc.errors import ConfigError, FglocError, OutputError
 from fgloc.instrumentation import repeated
@@ -113,14 +113,13 @@ def _finished(client: Any, todo: Sequence[Job], out: Path) -> Iterator[tuple[str
     distributed.wait(
         [client.submit(_prepare, job, out, key=f"detect-{images}", pure=False) for images, job in shared.items()]
     )
-    key_of = {client.submit(_attempt, job, out, key=job.key, pure=False, retries=0): job.key for job in todo}
-    futures = list(key_of)
+    futures = [client.submit(_attempt, job, out, key=job.key, pure=False, retries=0) for job in todo]
     for future in distributed.as_completed(futures):
-        error = future.exception() if future.status == "error" else _unwritable(future.result())
+        error = future.exception() if future.status == "error" else future.result()
         if error is not None and not isinstance(error, distributed.KilledWorker):
             raise error
         said = None if error is None else f"its worker died {_DEATHS + 1} times while it ran"
-        yield key_of[future], said
+        yield future.key, said
         future.release()
 
 
@@ -143,16 +142,13 @@ def _prepare(job: Job, out: Path) -> None:
         detect(job, out)
 
 
-def _attempt(job: Job, out: Path) -> str | OutputError:
+def _attempt(job: Job, out: Path) -> OutputError | None:
     """Execute a job; return an error of output instead of raising it, as the worker would log that at length."""
     try:
-        return execute(job, out)
+        execute(job, out)
     except OutputError as error:
         return error
-
-
-def _unwritable(result: object) -> OutputError | None:
-    return result if isinstance(result, OutputError) else None
+    return None
 
 
 @contextmanager
@@ -251,23 +247,9 @@ def plan_bags(bags: Sequence[Path], map_file: Path | None, configure: Callable[[
         except FglocError as error:
             errors[name] = str(error)
             continue
-        cells.append(
-            Cell(
-                recording=name,
-                variant="",
-                failure=NOTHING,
-                severity=None,
-                seed=0,
-                bag=bag,
-                map=map_file or find_beside(bag, "map.yaml"),
-                config_file=None,
-                config=config,
-                mode="batch",
-                start="configured",
-                chain=(),
-            )
-        )
-    jobs = make_jobs(cells, {name: name for name in names}, command)
+        map_path = map_file or find_beside(bag, "map.yaml")
+        cells.append(Cell(recording=name, bag=bag, map=map_path, config=config, mode="batch"))
+    jobs = make_jobs(cells, in_folders=True, command=command)
     return Plan(tuple(names), tuple(jobs), errors)
 
 

@@ -273,12 +273,12 @@ def train(
             "for one of these recordings: fgloc train --init BAG... --out train.yaml"
         )
     check_out(out)
-    from fgloc_training.train import CHECKPOINTS, Reporter, train_models
+    from fgloc_training.train import CHECKPOINTS, train_models
 
     (config,) = inputs
     kept = f"what was trained so far is kept in {out / CHECKPOINTS}; the same command goes on from there"
     with kept_on_interrupt(kept):
-        models = train_models(config, data or config.parent, out, start, Reporter(say, warn))
+        models = train_models(config, data or config.parent, out, start, say, warn)
     for model in models:
         say(f"model: {model}")
     next_step(f"fgloc smooth BAG --model {models[0]} --out DIR", "localize with it")

@@ -39,6 +39,7 @@ from fgloc.errors import ConfigError, FglocError, MapError, OutputError, Recordi
 from fgloc.files.atomic import check_out
 
 if TYPE_CHECKING:
+    from fgloc.calibration.anchors import AnchorSurvey
     from fgloc.calibration.survey import Distance, Survey
     from fgloc.config import Config
     from fgloc.types import LandmarkMap
@@ -96,15 +97,14 @@ def init(
             f"{bag}: no run is possible, as no topic tells how the robot moves: give one under recording.topics in "
             f"{out}, or record odometry, joint states, commands, an IMU or images of markers. {CONVERT}"
         )
+    survey = f"fgloc map {shown_path(bag)}{given} --out {shown_path(out.parent / 'map.yaml')}"
     if not {"image", "sightings"} & base_roles(found.roles):
         if "uwb" in found.roles and not load_config(out).uwb.anchors:  # type: ignore[attr-defined]
-            file = shown_path(out.parent / "map.yaml")
-            next_step(f"fgloc map {shown_path(bag)}{given} --out {file}", "survey the anchors")
+            next_step(survey, "survey the anchors")
         return  # nothing else to survey, or to calibrate on
     landmarks = find_beside(bag, "map.yaml")
     if landmarks is None:
-        file = shown_path(out.parent / "map.yaml")
-        next_step(f"fgloc map {shown_path(bag)}{given} --out {file}", "survey the markers")
+        next_step(survey, "survey the markers")
     else:
         next_step(
             f"fgloc calibrate {shown_path(bag)} --map {shown_path(landmarks)}{given} --out calibrated.yaml",
@@ -240,10 +240,7 @@ def _of_anchors(bag: Path, out: Path, settings: Config, config: Path | None) -> 
         sigma = np.sqrt(np.diag(landmark.cov))  # type: ignore[arg-type]
         rows.append((str(i), str(count), f"{x:.2f}, {y:.2f}, {z:.2f}", f"{sigma[:2].max():.2f}", f"{sigma[2]:.2f}"))
     say_table(("anchor", "ranges", "x, y, z [m]", "sigma", "of height"), rows)
-    for i, why in found.left_out.items():
-        say(f"left out: anchor {i}: {why}")
-    for note in found.notes:
-        say(f"note: {note}")
+    _tell_left_out("anchor", found)
     say(f"{len(found.landmarks)} anchors in {out}; for robot.yaml:")
     say("\n".join(["uwb:", *anchor_lines(found.landmarks.landmarks), f"  sigma_m: {found.noise_m:.2g}"]))
     if out.resolve() == beside(bag, "map.yaml").resolve():
@@ -259,11 +256,15 @@ def _tell(found: Survey, out: Path) -> None:
         sigma = np.sqrt(np.diag(np.eye(6) if cov is None else cov))
         rows.append((str(i), str(views), f"{1e3 * sigma[:3].max():.1f} mm", f"{np.degrees(sigma[3:].max()):.2f} deg"))
     say_table(("marker", "views", "position", "direction"), rows)
+    _tell_left_out("marker", found)
+    say(f"{len(found.landmarks)} landmarks in {out}")
+
+
+def _tell_left_out(kind: str, found: AnchorSurvey | Survey) -> None:
     for i, why in found.left_out.items():
-        say(f"left out: marker {i}: {why}")
+        say(f"left out: {kind} {i}: {why}")
     for note in found.notes:
         say(f"note: {note}")
-    say(f"{len(found.landmarks)} landmarks in {out}")
 
 
 def _with_markers(settings: Config, dictionary: str | None, size: float | None, given: LandmarkMap | None) -> Config:

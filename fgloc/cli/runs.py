@@ -236,7 +236,7 @@ def ablate(
 ) -> None:
     """Tell what the failure of each sensor costs. The same command goes on with a killed sweep."""
     from fgloc.ablation.jobs import make_jobs, only_sweep
-    from fgloc.ablation.report import failed, write_report
+    from fgloc.ablation.report import write_report
     from fgloc.ablation.suite import expand, load_suite
     from fgloc.ablation.sweep import sweep
 
@@ -252,9 +252,8 @@ def ablate(
         sentences = write_report(plan, jobs, records, out, typed(), forms)
     for sentence in sentences:
         say(sentence)
-    without = failed(jobs, records)
-    if without:
-        say(f"{len(without)} of {len(jobs)} runs gave no result; the report says why", err=True)
+    if without := sum(records[job.key].outcome != "done" for job in jobs):
+        say(f"{without} of {len(jobs)} runs gave no result; the report says why", err=True)
     say(f"report: {out / 'report.html'}")
 
 

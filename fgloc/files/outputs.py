@@ -21,11 +21,9 @@ from fgloc.types import Decision, IntArray, Protection, Trajectory
 
 _NS = 1_000_000_000
 _TUM_HEADER = "# stamp[s] x[m] y[m] z[m] qx qy qz qw\n"
-_COV_COLUMNS = ("xx", "xy", "xθ", "yy", "yθ", "θθ")
-_UPPER = np.triu_indices(3)
+_COV_COLUMNS: tuple[str, ...] = ("xx", "xy", "xθ", "yy", "yθ", "θθ")
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _SPATIAL_COV_COLUMNS: tuple[str, ...] = tuple(f"{a} {b}" for i, a in enumerate(_AXES) for b in _AXES[i:])
-_SPATIAL_UPPER = np.triu_indices(6)
 _STEP_COLUMNS = (
     "step",
     "stamp",
@@ -148,15 +146,15 @@ def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
     """
     if trajectory.covs is None:
         raise TrajectoryError(f"{path}: the trajectory has no covariances to write")
-    covs, upper = trajectory.covs, _UPPER
-    columns: tuple[str, ...] = _COV_COLUMNS
+    covs, columns = trajectory.covs, _COV_COLUMNS
     if trajectory.ground_covs is not None:
-        covs, columns, upper = trajectory.ground_covs, _SPATIAL_COV_COLUMNS, _SPATIAL_UPPER
-    with atomic_file(path) as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(("stamp", *columns))
-        for stamp, cov in zip(trajectory.stamps_ns.tolist(), covs, strict=True):
-            rows.writerow((_seconds(stamp), *(f"{value:.9e}" for value in cov[upper])))
+        covs, columns = trajectory.ground_covs, _SPATIAL_COV_COLUMNS
+    upper = np.triu_indices(covs.shape[-1])
+    rows = (
+        (_seconds(stamp), *(f"{value:.9e}" for value in cov[upper]))
+        for stamp, cov in zip(trajectory.stamps_ns.tolist(), covs, strict=True)
+    )
+    _write_table(path, ("stamp", *columns), rows)
 
 
 def write_protection_csv(path: Path, stamps_ns: IntArray, protections: Sequence[Protection]) -> None:
@@ -165,13 +163,11 @@ def write_protection_csv(path: Path, stamps_ns: IntArray, protections: Sequence[
     Raises:
         OutputError: the file cannot be written.
     """
-    with atomic_file(path) as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(("stamp", "along_m", "across_m", "yaw_rad", "position_m", "cause", "alert"))
-        for stamp, p in zip(stamps_ns.tolist(), protections, strict=True):
-            rows.writerow(
-                (_seconds(stamp), *(f"{value:.6g}" for value in (*p.bound, p.position_m)), p.cause, int(p.alert))
-            )
+    rows = (
+        (_seconds(stamp), *(f"{value:.6g}" for value in (*p.bound, p.position_m)), p.cause, int(p.alert))
+        for stamp, p in zip(stamps_ns.tolist(), protections, strict=True)
+    )
+    _write_table(path, ("stamp", "along_m", "across_m", "yaw_rad", "position_m", "cause", "alert"), rows)
 
 
 def write_steps_csv(path: Path, decisions: Iterable[Decision], judged: Mapping[Decision, int] | None = None) -> None:
@@ -186,13 +182,20 @@ def write_steps_csv(path: Path, decisions: Iterable[Decision], judged: Mapping[D
         OutputError: the file cannot be written.
     """
     numbers = judged or {}
+
+    def row(d: Decision) -> tuple[object, ...]:
+        fit = (f"{d.residual:.6g}", f"{d.nis:.6g}", d.dof, f"{d.weight:.6g}")
+        shown = ("" if math.isnan(value) else f"{value:.6g}" for value in (d.threshold, d.shift_m))
+        return d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, d.reason, *shown, numbers.get(d, "")
+
+    _write_table(path, _STEP_COLUMNS, map(row, decisions))
+
+
+def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     with atomic_file(path) as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(_STEP_COLUMNS)
-        for d in decisions:
-            fit = (f"{d.residual:.6g}", f"{d.nis:.6g}", d.dof, f"{d.weight:.6g}")
-            last = (d.reason, *_shown(d), numbers.get(d, ""))
-            rows.writerow((d.step, _seconds(d.stamp_ns), d.kind, d.landmark_id, *fit, *last))
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(columns)
+        table.writerows(rows)
 
 
 def _check_finite(path: Path, trajectory: Trajectory) -> None:
@@ -203,12 +206,6 @@ def _check_finite(path: Path, trajectory: Trajectory) -> None:
     if bad.size:
         pose = trajectory.poses[bad[0]].tolist()
         raise TrajectoryError(f"{path}: pose {bad[0]} is {pose}, expected finite x, y, yaw; nothing was written")
-
-
-def _shown(d: Decision) -> tuple[str, str]:
-    """Threshold and shift; empty where there is none."""
-    threshold, shift = ("" if math.isnan(value) else f"{value:.6g}" for value in (d.threshold, d.shift_m))
-    return threshold, shift
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

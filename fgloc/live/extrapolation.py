@@ -166,22 +166,12 @@ _Events = Mapping[type[MotionEvent], Sequence[MotionEvent]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Means:
-    """Parts by which all anchors are propagated until the parts of the run are built again."""
-
-    joint: JointCalibration | None
-    model: Any
-    factors: LandmarkFactors  # hold what is known of the installation
-    attitude: Attitude | None
-    signals_back_ns: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Held:
     """An anchor, with wheels that have read the events which were asked for so far."""
 
     anchor: Anchor
-    means: _Means
+    parts: MotionParts  # those of the run when it was made
+    factors: LandmarkFactors  # of these parts; hold what is known of the installation
     wheels: WheelMotion
 
     @property
@@ -212,7 +202,7 @@ class Extrapolator:
         self._lock = threading.Lock()  # of what is kept
         self._asked = threading.Lock()  # of what carries on
         self._config = config
-        self._means: _Means | None = None
+        self._parts: tuple[MotionParts, LandmarkFactors] | None = None
         self._history_ns = round(config.keyframes.history_s * 1e9)
         self._kept_ns = max(self._history_ns, _BEFORE_NS)
         self._clock = ClockGuard(config.gate)
@@ -223,12 +213,10 @@ class Extrapolator:
 
     def begin(self, parts: MotionParts) -> None:
         """Use newly built parts of the run; earlier anchors are forgotten."""
-        model = copy.deepcopy(parts.model)  # it writes into buffers of its own
+        parts = replace(parts, model=copy.deepcopy(parts.model))  # it writes into buffers of its own
         with self._lock:
             self._kept_ns = max(self._history_ns, _BEFORE_NS, parts.signals_back_ns)
-            self._means = _Means(
-                parts.joint, model, LandmarkFactors(None, parts.installation), parts.attitude, parts.signals_back_ns
-            )
+            self._parts = parts, LandmarkFactors(None, parts.installation)
             self._anchors.clear()
 
     def add(self, event: MotionEvent) -> None:
@@ -252,11 +240,11 @@ class Extrapolator:
     def anchor(self, anchor: Anchor) -> None:
         """Propagate from this anchor from now on."""
         with self._lock:
-            assert self._means is not None
+            assert self._parts is not None
             if anchor.segment != self._segment:
                 self._anchors.clear()
                 self._segment = anchor.segment
-            self._anchors.append(_Held(anchor, self._means, WheelMotion(self._config.wheels)))
+            self._anchors.append(_Held(anchor, *self._parts, WheelMotion(self._config.wheels)))
             while self._anchors[0].stamp_ns < anchor.stamp_ns - HISTORY_S * 1e9:
                 self._anchors.popleft()
             for events in self._events.values():
@@ -281,7 +269,7 @@ class Extrapolator:
         if mode is Mode.OK and since_fix_s > self._config.estimator.dead_reckoning_after_s:
             mode = Mode.DEAD_RECKONING
         cov = se2.rotate_cov(belief.cov + anchor.added_cov, float(belief.pose[2]))
-        ground = spatial(belief, held.means.factors.installation, anchor.added_cov)
+        ground = spatial(belief, held.factors.installation, anchor.added_cov)
         return LivePose(at_ns, belief.pose, cov, mode, anchor.stamp_ns, ground)
 
     def _step(self, anchor: Anchor, end_ns: int) -> Step:
@@ -297,7 +285,7 @@ class Extrapolator:
 
     def _past(self, held: _Held) -> _Events:
         """Events of the measured signals that the learned motion reads before the anchor, by class."""
-        back_ns = held.means.signals_back_ns
+        back_ns = held.parts.signals_back_ns
         if not back_ns:
             return {}
         return {kind: self._window(kind, held.stamp_ns - back_ns, held.stamp_ns) for kind in self._events}
@@ -315,16 +303,16 @@ class Extrapolator:
         return tuple(events[first : bisect_left(events, end_ns, key=_stamp) + 1])
 
     def _carried(self, held: _Held, step: Step, past: _Events) -> PoseWithCovariance:
-        anchor, means = held.anchor, held.means
-        means.factors.estimated = anchor.known
+        anchor, parts, factors = held.anchor, held.parts, held.factors
+        factors.estimated = anchor.known
         sensors = MotionSensors(
             held.wheels,
-            None if anchor.learned is None or means.model is None else anchor.learned.fork(means.model, past),
-            means.joint,
+            None if anchor.learned is None or parts.model is None else anchor.learned.fork(parts.model, past),
+            parts.joint,
             None if anchor.gyro is None else anchor.gyro.fork(),
-            means.attitude,
+            parts.attitude,
         )
-        sources = MotionSources(self._config, sensors, means.factors)
+        sources = MotionSources(self._config, sensors, factors)
         belief, start_ns = anchor.belief, step.start_ns
         while start_ns < step.stamp_ns:
             end_ns = min(start_ns + _PIECE_NS, step.stamp_ns)
@@ -333,7 +321,7 @@ class Extrapolator:
             budget = _without_slip(anchor.budget, readings, sources)
             motions = budget.combine(readings, sources.rules) or [sources.unknown(piece, readings)]
             known = anchor.known if belief.installation is None else belief.installation
-            belief = predict(belief, known, means.factors.installation, motions)
+            belief = predict(belief, known, factors.installation, motions)
             start_ns = end_ns
         return belief
 

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -179,21 +179,6 @@ class _TopicMeter:
         return TopicStatus(self._role, self._count, rate, self._delay_s, silent_s, missed)
 
 
-@dataclass(slots=True)
-class _Publisher:
-    """The publisher whose messages of a topic are used."""
-
-    name: str
-    received_ns: int
-
-    def has_the_topic(self, name: str, received_ns: int) -> bool:
-        """Whether a message is of that publisher, or of one that replaces it after a silence."""
-        if name != self.name and abs(received_ns - self.received_ns) < _SUCCESSION_NS:
-            return False
-        self.name, self.received_ns = name, received_ns
-        return True
-
-
 class Reception:
     """Receives every event as it arrives; used under the lock of its owner.
 
@@ -207,7 +192,7 @@ class Reception:
         self._selection = LiveFacts(config, None, None)
         self._gate = EventValidator(reported_bounds(config))
         self.dropped: Counter[str] = Counter()
-        self._publishers: dict[Source, _Publisher] = {}
+        self._publishers: dict[Source, tuple[str, int]] = {}  # whose messages are used, and when the last was received
         self._meters: dict[str, _TopicMeter] = {}
         self._clocks = TopicClocks()
         self._notes: dict[str, None] = {}  # an ordered set
@@ -231,13 +216,17 @@ class Reception:
         return self._clocks.correct(event)
 
     def _is_of_its_publisher(self, event: Event, publisher: str) -> bool:
-        """Whether a message is of the one publisher that its topic should have; transforms have any number."""
-        source = source_of(event)
-        first = self._publishers.pop(source, None) or _Publisher(publisher, event.received_ns)
-        self._publishers[source] = first  # the newest at the end
+        """Whether a message is of the one publisher that its topic should have; transforms have any number.
+
+        Another one replaces it after a silence.
+        """
+        source, received_ns = source_of(event), event.received_ns
+        name, heard_ns = self._publishers.pop(source, (publisher, received_ns))
+        is_second = publisher != name and abs(received_ns - heard_ns) < _SUCCESSION_NS
+        self._publishers[source] = (name, heard_ns) if is_second else (publisher, received_ns)  # the newest at the end
         if len(self._publishers) > MOST_NAMES:  # joints of ever new names on one topic
             del self._publishers[next(iter(self._publishers))]
-        return first.has_the_topic(publisher, event.received_ns)
+        return not is_second
 
     def motion(self, event: Event) -> MotionEvent | None:
         """Event, as the gate lets it through, if it is of the motion source to be used; else None."""

@@ -32,7 +32,6 @@ from fgloc.live.state import (
     matrix3,
     odometry_state,
     resumed_installation,
-    row3,
 )
 from fgloc.recording.transforms import FrameTree
 from fgloc.sensor_setup import base_frame, camera_frame, given_pose
@@ -238,7 +237,7 @@ class LiveFacts:
         if given_pose(config, "optical") is not None:
             return ""
         frame = camera_frame(seen)
-        base_name = base_frame(self, self._config, self.first)
+        base_name = base_frame(self, self._config)
         if frame.lstrip("/") != base_name.lstrip("/") and not (frame in self.frames and base_name in self.frames):
             return f"no transform from {base_name} to {frame!r} yet, and no recording.sightings_pose"
         return ""
@@ -449,11 +448,11 @@ class OnlineRun:
             map_fingerprint=self._fingerprint,
             saved_ns=time.time_ns(),
             stamp_ns=estimate.stamp_ns,
-            pose=row3(estimate.pose),
+            pose=se2.triple(estimate.pose),
             cov=matrix3(_body_cov(estimate)),
             mode=estimate.mode,
             fastest=self._fastest,
-            twist=row3(twist),
+            twist=se2.triple(twist),
             installation=InstallationState(
                 names=localizer.factors.installation.names,
                 mean=tuple(installed.mean.tolist()),

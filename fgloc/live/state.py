@@ -153,14 +153,8 @@ def resumed_installation(saved: InstallationState, installation: Installation) -
 
 def matrix3(cov: FloatArray) -> tuple[Row3, Row3, Row3]:
     """A ``(3, 3)`` array as tuples."""
-    a, b, c = (row3(row) for row in np.asarray(cov))
+    a, b, c = map(se2.triple, cov)
     return a, b, c
-
-
-def row3(values: FloatArray) -> Row3:
-    """A ``(3,)`` array as a tuple."""
-    x, y, z = np.asarray(values).tolist()
-    return x, y, z
 
 
 def _problem(state: RunState) -> str:
@@ -204,7 +198,7 @@ def odometry_state(event: MotionEvent) -> OdometryState | None:
     told = event.odometer
     if told is None or not np.isfinite(told.pose).all():
         return None
-    return OdometryState(topic=event.topic, frame_id=told.frame_id, stamp_ns=event.stamp_ns, pose=row3(told.pose))
+    return OdometryState(topic=event.topic, frame_id=told.frame_id, stamp_ns=event.stamp_ns, pose=se2.triple(told.pose))
 
 
 def carried_over(state: RunState, step: Step, config: Config, wall_ns: int) -> tuple[PoseWithCovariance | None, str]:

@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -38,12 +39,6 @@ from fgloc.types import CameraInfoEvent, Event, TransformEvent, TruthEvent
 
 TF_TYPES = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 HEADERLESS = frozenset({"geometry_msgs/msg/Twist", "geometry_msgs/msg/Pose2D"})
-
-
-def header_stamp(message: Any) -> int | None:
-    """Stamp [ns] of the message's header; None if it has none."""
-    header = getattr(message, "header", None)
-    return None if header is None else nanoseconds(header.stamp)
 
 
 def transforms(message: Any, received_ns: int, topic: str, static: bool) -> list[TransformEvent]:
@@ -87,8 +82,8 @@ class MessageEvents:
             return list(transforms(content, received_ns, topic, topic.rstrip("/").endswith("tf_static")))
         if role is None:
             return []
-        stamp_ns = None if role in self._config.received_stamps else header_stamp(content)
-        stamp_ns = received_ns if stamp_ns is None else stamp_ns
+        header = None if role in self._config.received_stamps else getattr(content, "header", None)
+        stamp_ns = received_ns if header is None else nanoseconds(header.stamp)
         stamp_ns += round(self._config.stamp_offset_s.get(role, 0.0) * 1e9)
         if topic in self._fields.topics:
             return self._fields.events(content, (stamp_ns, received_ns, topic))
@@ -103,16 +98,10 @@ def _camera_info(m: Any, when: When) -> Event:
     return CameraInfoEvent(*when, m.header.frame_id, m.width, m.height, m.distortion_model, matrix(K, 3), vector(D))
 
 
-def _pose_truth(m: Any, when: When) -> Event:
-    return TruthEvent(*when, m.header.frame_id, xyz(m.pose.position), xyzw(m.pose.orientation))
-
-
-def _covariance_truth(m: Any, when: When) -> Event:
-    return TruthEvent(*when, m.header.frame_id, xyz(m.pose.pose.position), xyzw(m.pose.pose.orientation))
-
-
-def _transform_truth(m: Any, when: When) -> Event:
-    return TruthEvent(*when, m.header.frame_id, xyz(m.transform.translation), xyzw(m.transform.rotation))
+def _truth(position: str, orientation: str) -> Converter:
+    """Converter of messages that have position and orientation in these fields."""
+    place, turn = attrgetter(position), attrgetter(orientation)
+    return lambda m, when: TruthEvent(*when, m.header.frame_id, xyz(place(m)), xyzw(turn(m)))
 
 
 def _point_truth(m: Any, when: When) -> Event:
@@ -129,14 +118,15 @@ _ODOMETRY, _TWIST = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistWithCovaria
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"  # as Vicon's bridge publishes poses
 _MOST_OF_TF = 2000  # messages from the beginning, to see which frames move
 POINT = "geometry_msgs/msg/PointStamped"  # a total station's, without a yaw; or a click on a map
+_COVARIANCE_TRUTH = _truth("pose.pose.position", "pose.pose.orientation")
 CONVERTERS: dict[Role, dict[str, Converter]] = {
     "camera_info": {"sensor_msgs/msg/CameraInfo": _camera_info},
     "truth": {
-        "geometry_msgs/msg/PoseStamped": _pose_truth,
-        "geometry_msgs/msg/PoseWithCovarianceStamped": _covariance_truth,
+        "geometry_msgs/msg/PoseStamped": _truth("pose.position", "pose.orientation"),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": _COVARIANCE_TRUTH,
         "geometry_msgs/msg/Pose2D": _planar_truth,
-        _TRANSFORM: _transform_truth,
-        _ODOMETRY: _covariance_truth,
+        _TRANSFORM: _truth("transform.translation", "transform.rotation"),
+        _ODOMETRY: _COVARIANCE_TRUTH,
         POINT: _point_truth,
     },
 }
@@ -617,7 +607,3 @@ class Recording:
     def size_bytes(self) -> int:
         """Size of the storage files."""
         return self._storage.size_bytes
-
-    def content_hash(self) -> str:
-        """Hex SHA-256 of the storage file, or of several one after the other."""
-        return self._storage.content_hash()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import filecmp
-import hashlib
 import heapq
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -384,15 +383,6 @@ class Storage:
     def size_bytes(self) -> int:
         """Size of the storage files."""
         return sum(file.stat().st_size for file in self.files)
-
-    def content_hash(self) -> str:
-        """Hex SHA-256 of the storage files' bytes, one after the other."""
-        digest = hashlib.sha256()
-        for file in self.files:
-            with file.open("rb") as stream:
-                while block := stream.read(1 << 20):
-                    digest.update(block)
-        return digest.hexdigest()
 
 
 class _File:

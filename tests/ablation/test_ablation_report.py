@@ -16,13 +16,12 @@ from typer.testing import CliRunner
 import fgloc
 from fgloc import cli
 from fgloc.ablation.failures import AnyFailure
-from fgloc.ablation.jobs import Cost, Job, Record, execute, make_jobs
+from fgloc.ablation.jobs import Cost, Job, Record, Track, execute, make_jobs
 from fgloc.ablation.report import (
     ATE,
     METRICS,
     Curves,
     Entry,
-    Tracks,
     _curves,
     _measurable,
     join,
@@ -250,7 +249,7 @@ def test_few_runs_are_drawn_one_by_one_and_axes_speak(bag):
     many = Entry("x", 1.0, "full", ATE, (2.0, 2.5, 3.0, 3.5, 4.0), 5)
     axes = plot_severity([Curves("x", "y", {"full": [many, many]})], ATE.label).axes[0]
     assert len(axes.collections) == 1
-    figure = plot_tracks([Tracks("x", [(0, 0), (1, 1)], [(0, 0), (1, 0)])])
+    figure = plot_tracks({"x": Track(estimate=[(0, 0), (1, 1)], truth=[(0, 0), (1, 0)])})
     assert [t.get_text() for t in figure.legends[0].get_texts()] == ["estimate", "truth", "start"]
 
 

@@ -10,7 +10,7 @@ from fgloc.config import MarkersConfig
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray
-from fgloc_datasets.sim.camera import Frame, Renderer, RenderError, frames, pose_at
+from fgloc_datasets.sim.camera import Image, Renderer, RenderError, Shot, exposures, pose_at
 from fgloc_datasets.sim.physics import Log, Scene, make_scene, simulate
 from fgloc_datasets.sim.scenario import Camera, Control, Scenario
 from fgloc_datasets.sim.scene import camera_rotation, intrinsics
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.render
 
 
 @pytest.fixture(scope="module")
-def second() -> tuple[Scene, Log, list[Frame]]:
+def second() -> tuple[Scene, Log, list[tuple[Shot, Image]]]:
     """One rendered second: a spin in place."""
     camera = Camera(rate_hz=5, max_exposure_s=0.006)
     control = Control(functions=("spin",), rest_s=0.2)
@@ -29,7 +29,7 @@ def second() -> tuple[Scene, Log, list[Frame]]:
     except RenderError as error:
         pytest.skip(str(error))
     log = simulate(scene)
-    return scene, log, list(frames(scene, log))
+    return scene, log, [(shot, take()) for shot, take in exposures(scene, log)]
 
 
 def project(scene: Scene, log: Log, stamp_s: float, marker_id: int) -> FloatArray:
@@ -43,13 +43,13 @@ def project(scene: Scene, log: Log, stamp_s: float, marker_id: int) -> FloatArra
     return cv2.projectPoints(in_cam, np.zeros(3), np.zeros(3), intrinsics(camera), np.array(camera.distortion))[0][:, 0]
 
 
-def test_detected_corners_lie_where_truth_projects(second: tuple[Scene, Log, list[Frame]]) -> None:
+def test_detected_corners_lie_where_truth_projects(second: tuple[Scene, Log, list[tuple[Shot, Image]]]) -> None:
     scene, log, taken = second
     detector = MarkerDetector(scene.landmarks.dictionary, MarkersConfig())
     errors = [
-        found - project(scene, log, frame.stamp_s, marker_id)
-        for frame in taken
-        for marker_id, found in detector.find(frame.image)
+        found - project(scene, log, shot.stamp_s, marker_id)
+        for shot, image in taken
+        for marker_id, found in detector.find(image)
     ]
     assert len(errors) >= 6
     flat = np.concatenate(errors)
@@ -57,9 +57,9 @@ def test_detected_corners_lie_where_truth_projects(second: tuple[Scene, Log, lis
     assert np.sqrt((flat**2).mean(axis=0)).max() < 0.5
 
 
-def test_frames_are_stamped_in_the_middle_of_the_exposure(second: tuple[Scene, Log, list[Frame]]) -> None:
+def test_frames_are_stamped_in_the_middle_of_the_exposure(second: tuple[Scene, Log, list[tuple[Shot, Image]]]) -> None:
     _, _, taken = second
     assert len(taken) == 5
-    starts = np.array([f.stamp_s - 0.5 * f.exposure_s for f in taken])
+    starts = np.array([f.stamp_s - 0.5 * f.exposure_s for f, _ in taken])
     np.testing.assert_allclose(np.diff(starts), 0.2, atol=1e-9)
-    assert all(f.exposure_s == pytest.approx(0.006) for f in taken)
+    assert all(f.exposure_s == pytest.approx(0.006) for f, _ in taken)

@@ -13,7 +13,7 @@ from fgloc.config import MarkersConfig, load_config
 from fgloc.frames import quaternion_matrix
 from fgloc.sensors.markers.detector import MarkerDetector
 from fgloc.types import FloatArray, Landmark
-from fgloc_datasets.sim.camera import Renderer, RenderError, frames, pose_at
+from fgloc_datasets.sim.camera import Renderer, RenderError, exposures, pose_at
 from fgloc_datasets.sim.installed import MountedCamera, load_installed
 from fgloc_datasets.sim.physics import Log, make_scene, simulate
 from fgloc_datasets.sim.record import record
@@ -53,11 +53,11 @@ def test_images_show_the_true_markers_through_the_true_camera() -> None:
         hung = installed.map.landmark_map()
         assert installed.camera is not None
         assert installed.believed.camera is not None
-        frame = list(frames(scene, log))[-1]
-        for marker_id, found in detector.find(frame.image):
-            true.append(found - project(installed.camera, hung.landmarks[marker_id], log, frame.stamp_s))
+        *_, (shot, image) = ((shot, take()) for shot, take in exposures(scene, log))
+        for marker_id, found in detector.find(image):
+            true.append(found - project(installed.camera, hung.landmarks[marker_id], log, shot.stamp_s))
             said = scene.surveyed.landmarks[marker_id]
-            believed.append(found - project(installed.believed.camera, said, log, frame.stamp_s))
+            believed.append(found - project(installed.believed.camera, said, log, shot.stamp_s))
     assert len(true) >= 6
     assert np.abs(np.concatenate(true)).max() < 0.3
     assert np.median(np.linalg.norm(np.concatenate(believed), axis=1)) > 1.5

@@ -245,9 +245,7 @@ def test_suite_resumes_and_skips_what_is_done(tmp_path: Path) -> None:
     record(todo[0].scenario, todo[0].seed, tmp_path / "out" / todo[0].folder, camera=False)
     killed = tmp_path / "out" / "a" / ".test_2.partial-of-a-killed-recorder"
     killed.mkdir(parents=True)
-    said: list[str] = []
-    assert record_suite(todo, tmp_path / "out", camera=False, workers=1, said=said.append) == 1
-    assert said == ["a/test_2"]
+    assert record_suite(todo, tmp_path / "out", camera=False, workers=1) == 1
     assert not killed.exists()
     assert (tmp_path / "out" / "a" / "test_2" / "bag" / "metadata.yaml").is_file()
     assert record_suite(todo, tmp_path / "out", camera=False, workers=1) == 0

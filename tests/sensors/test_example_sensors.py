@@ -345,13 +345,8 @@ NO_CLOCK = {"time_offset_sigma_s": 0.0}  # that of another package's sensor is t
 
 def write_cloud(bag, topic, stamp_ns, seen, received_ns):
     """Ranges and bearings as the points of a cloud, with an unknown one."""
-    points = [
-        bag.make("geometry_msgs/msg/Point32", x=r * math.cos(b), y=r * math.sin(b), z=0.0)
-        for _, r, b in [*seen, (99, 1.0, 0.0)]
-    ]
-    ids = np.array([*(i for i, _, _ in seen), 99], dtype=np.float32)
-    channel = bag.make("sensor_msgs/msg/ChannelFloat32", name="id", values=ids)
-    content = {"points": points, "channels": [channel]}
+    points = [{"x": r * math.cos(b), "y": r * math.sin(b)} for _, r, b in [*seen, (99, 1.0, 0.0)]]
+    content = {"points": points, "channels": [{"name": "id", "values": [*(i for i, _, _ in seen), 99]}]}
     bag._write("/numbered", "sensor_msgs/msg/PointCloud", stamp_ns, received_ns, "base_link", content)
 
 
@@ -392,16 +387,9 @@ def test_landmarks_of_another_package_are_treated_as_those_of_the_built_in_senso
 def write_twist(bag, topic, stamp_ns, pose, twist, received_ns):
     """The twist of an odometry alone, in a message that no built-in sensor reads."""
     v, omega = twist
-    vector = "geometry_msgs/msg/Vector3"
-    made = bag.make(
-        "geometry_msgs/msg/Twist",
-        linear=bag.make(vector, x=v, y=0.0, z=0.0),
-        angular=bag.make(vector, x=0.0, y=0.0, z=omega),
-    )
-    made = bag.make("geometry_msgs/msg/TwistWithCovariance", twist=made, covariance=np.zeros(36))
-    bag._write(
-        "/velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", stamp_ns, received_ns, "base_link", {"twist": made}
-    )
+    content = {"twist": {"twist": {"linear": {"x": v}, "angular": {"z": omega}}}}
+    kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+    bag._write("/velocity", kind, stamp_ns, received_ns, "base_link", content)
 
 
 def test_motion_in_a_message_of_another_package_is_that_of_the_wheels(folders, tmp_path):

@@ -35,7 +35,7 @@ from fgloc_training.data import Run
 from fgloc_training.models import DisplacementNet
 from fgloc_training.optimize import Checkpoint, Checkpoints
 from fgloc_training.recordings import controls, draw_controls
-from fgloc_training.rollouts import relative, roll_kinematics, roll_model, roll_sources
+from fgloc_training.rollouts import roll_kinematics, roll_model, roll_sources
 from fgloc_training.train import card_of, new_net, tensors_of
 
 
@@ -148,7 +148,7 @@ def test_torch_and_numpy_agree_on_measured_signals(
     samples, start = net.samples([run]), 20
     poses = net.roll(samples, torch.tensor([start]), 20).detach().numpy()[0]
     for steps in (2, 10, 20):  # of 0.1 s, all within one window for the network, in steps of 0.2 s for the model
-        got = relative(rolled.track[[start // 2]], rolled.track[[(start + steps) // 2]])[0]
+        got = se2.between_array(rolled.track[[start // 2]], rolled.track[[(start + steps) // 2]])[0]
         np.testing.assert_allclose(got[:2], poses[steps - 1, :2], atol=2e-6)
         np.testing.assert_allclose(se2.wrap(got[2] - poses[steps - 1, 2]), 0.0, atol=2e-6)
 

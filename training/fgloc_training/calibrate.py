@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter
 
+from fgloc import se2
 from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError
+from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import ErrorMemory, JointErrors, Kinematics, Lag, Matrix, ModelCard, Row
-from fgloc.sensors.learned.network import calibrated
+from fgloc.sensors.learned.network import CommandHistory, calibrated
 from fgloc.sensors.learned.sensor import Tensors, model_of
 from fgloc.types import FloatArray
 from fgloc_training.config import AdaptationConfig, CalibrationConfig
@@ -38,16 +39,8 @@ _MIN_LONG = 0.1  # of what short windows show: what cancels in the end still lea
 _FIT_WINDOW_S = 2.0
 
 
-class MeanTwists(Protocol):
-    """Interface of commands, or of wheels in their place: means of v and ω."""
-
-    def means(self, limits_s: FloatArray) -> FloatArray:
-        """Mean (v, ω) ``(..., m - 1, 2)`` between limits ``(..., m)``."""
-        ...
-
-
 def fit_kinematics(
-    runs: list[Run], twists_of: Callable[[Run], MeanTwists] = lambda run: run.track, sideways: bool = False
+    runs: list[Run], twists_of: Callable[[Run], CommandHistory | Signal] = lambda run: run.track, sideways: bool = False
 ) -> Kinematics:
     """Scale, pull to one side and delay that fit the true motion over two seconds best, in the least-squares sense.
 
@@ -144,7 +137,7 @@ def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Ro
     e, basis, (window_s, of_window) = np.concatenate(errors), np.concatenate(composed), _distinct(lengths)
 
     def fitted(times_s: tuple[float, ...], start: FloatArray) -> tuple[FloatArray, float]:
-        all_hidden = ErrorMemory(time_s=_row(np.array(times_s)), share=(_ALMOST_ONE,) * 3)
+        all_hidden = ErrorMemory(time_s=se2.triple(times_s), share=(_ALMOST_ONE,) * 3)
         shown = np.array([all_hidden.growth(horizon) for horizon in window_s])[of_window, :, None, None]
         of_short = _MIN_LONG * shown + 1.0 - shown
         return _most_likely(e, np.concatenate([shown * basis, of_short * basis], axis=1), start)
@@ -159,7 +152,7 @@ def fit_variance(rollouts: list[Rollout], config: CalibrationConfig) -> tuple[Ro
     more, short = np.maximum(best, _MIN_FACTOR).reshape(2, 3)
     long = more + _MIN_LONG * short
     share = np.minimum(1.0 - short / long, _ALMOST_ONE)
-    return _row(long), ErrorMemory(time_s=_row(np.array(times_s)), share=_row(share))
+    return se2.triple(long), ErrorMemory(time_s=se2.triple(times_s), share=se2.triple(share))
 
 
 def fit_joint(learned: list[Rollout], wheels: list[Rollout], config: CalibrationConfig) -> JointErrors:
@@ -242,12 +235,7 @@ def _diagonal(values: FloatArray, axes: list[int]) -> FloatArray:
 
 
 def _rows(matrix: FloatArray) -> Matrix:
-    x, y, yaw = (_row(row) for row in matrix)
-    return x, y, yaw
-
-
-def _row(values: FloatArray) -> Row:
-    x, y, yaw = (float(v) for v in values)
+    x, y, yaw = map(se2.triple, matrix)
     return x, y, yaw
 
 

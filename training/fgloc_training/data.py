@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.signal import savgol_filter
 
+from fgloc import se2
 from fgloc.config import Config, GyroConfig, RecordingConfig, WheelsConfig, load_config
 from fgloc.errors import RecordingError, TrajectoryError
 from fgloc.evaluation.results import read_modes
@@ -26,7 +27,7 @@ from fgloc.frames import rotations
 from fgloc.intake.keyframing import EventBuffer
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.recording.truth import base_ground, base_pose, lacks_yaw
-from fgloc.sensor_setup import mounted_up
+from fgloc.sensor_setup import RecordingFacts, mounted_up
 from fgloc.sensors.base import Mounting, WheelJoints
 from fgloc.sensors.commands import told
 from fgloc.sensors.gyro import Gyro, ImuEvent
@@ -206,8 +207,7 @@ def in_robots_plane(poses: FloatArray, ground: FloatArray) -> FloatArray:
     way = np.einsum("mji,mj->mi", R[:-1], moved)  # in the axes of the robot
     turn = np.einsum("mji,mjk->mik", R[:-1], R[1:])
     yaw = poses[0, 2] + np.concatenate([[0.0], np.cumsum(0.5 * (turn[:, 1, 0] - turn[:, 0, 1]))])
-    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
-    steps = np.column_stack([c * way[:, 0] - s * way[:, 1], s * way[:, 0] + c * way[:, 1]])
+    steps = se2.turned(way[:, :2], yaw[:-1])
     return np.column_stack([poses[0, :2] + np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), yaw])
 
 
@@ -359,7 +359,7 @@ def _read(path: Path, config: DataConfig, truth_from: Path | None) -> _Recorded:
                 truth.append(event)
             else:
                 sensed.append(event)
-        up = mounted_up(recording, settings, {type(event): event for event in reversed(sensed)})
+        up = mounted_up(RecordingFacts(recording), settings)
     if truth_from is None:
         stamps, rows = np.array([e.stamp_ns for e in truth]), np.array([base_pose(e, settings.truth) for e in truth])
         if len(truth) > 1:
@@ -498,9 +498,7 @@ def _smooth(
     smooth = savgol_filter(raw, window, 3, axis=0)
     rates = savgol_filter(raw, window, 3, deriv=1, delta=fine[1] - fine[0], axis=0)
     poses, rates = (np.column_stack([np.interp(times, fine, c) for c in part.T]) for part in (smooth, rates))
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    body = np.column_stack([c * rates[:, 0] + s * rates[:, 1], c * rates[:, 1] - s * rates[:, 0], rates[:, 2]])
-    return poses, body
+    return poses, np.column_stack([se2.turned(rates[:, :2], -poses[:, 2]), rates[:, 2]])
 
 
 def _has_truth(t_truth: FloatArray, times: FloatArray, config: DataConfig) -> NDArray[np.bool_]:

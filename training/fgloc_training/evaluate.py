@@ -18,6 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
+from fgloc import se2
 from fgloc.files.outputs import write_text
 from fgloc.sensors.learned.card import Kinematics, ModelCard
 from fgloc.sensors.learned.network import MotionModel
@@ -26,7 +27,7 @@ from fgloc.types import FloatArray
 from fgloc_training.calibrate import nis
 from fgloc_training.config import DataConfig
 from fgloc_training.data import Run, load_runs
-from fgloc_training.rollouts import Rollout, relative, roll_kinematics, roll_model, roll_sources
+from fgloc_training.rollouts import Rollout, roll_kinematics, roll_model, roll_sources
 
 # --- Pictures ---------------------------------------------------------------------------------------------------------
 
@@ -49,10 +50,8 @@ def draw_tracks(path: Path, rollouts: list[Rollout]) -> None:
         steps = round(_WINDOW_S / rollout.step_s)
         for first in range(0, len(rollout.motions), steps):
             piece = slice(first, first + steps + 1)
-            moved = relative(np.broadcast_to(rollout.track[first], rollout.track[piece].shape), rollout.track[piece])
-            start = rollout.truth[first]
-            c, s = np.cos(start[2]), np.sin(start[2])
-            px, py = start[0] + c * moved[:, 0] - s * moved[:, 1], start[1] + s * moved[:, 0] + c * moved[:, 1]
+            moved = se2.between_array(rollout.track[[first]], rollout.track[piece])
+            px, py = se2.placed(rollout.truth[first], moved[:, :2]).T
             axes.plot(px, py, color="C0", linewidth=0.9, label="predicted" if first == 0 else None)
             axes.plot(px[0], py[0], "o", color="C2", markersize=3, label="start anew" if first == 0 else None)
         axes.set_aspect("equal", "datalim")
@@ -144,9 +143,8 @@ def evaluate(rollouts: list[Rollout], horizon_s: float) -> Figures:
         if not len(k):
             continue
         for j in range(1, n + 1):
-            error = relative(
-                relative(rollout.track[k], rollout.track[k + j]), relative(rollout.truth[k], rollout.truth[k + j])
-            )
+            predicted, actual = (se2.between_array(poses[k], poses[k + j]) for poses in (rollout.track, rollout.truth))
+            error = se2.between_array(predicted, actual)
             ates.append(np.hypot(error[:, 0], error[:, 1]))
             yaws.append(np.abs(error[:, 2]))
         end_errors.append(ates[-1])

@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from fgloc.errors import RecordingError
@@ -128,6 +129,7 @@ def at_start_variance(head: nn.Linear) -> nn.Linear:
 
 # --- Networks ---------------------------------------------------------------------------------------------------------
 
+_LEAST_STD = 1e-3  # of an input that does not change
 _RATE_S = 0.2  # a robot's velocities change within about this time
 
 
@@ -154,12 +156,21 @@ def mlp(widths: list[int]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-class DisplacementNet(nn.Module):
-    """Residual twist on the best known kinematics; log-variances from a network of their own (gru: a layer)."""
+class Scaled(nn.Module):
+    """A network with normalized inputs and scaled outputs; the figures are saved with it."""
 
     mean: Tensor
     std: Tensor
     scale: Tensor
+
+    def scale_by(self, mean: ArrayLike, std: ArrayLike, scale: ArrayLike) -> None:
+        """Take mean and standard deviation ``(n,)`` of the inputs, and the scale of the outputs."""
+        for name, values in (("mean", mean), ("std", np.maximum(std, _LEAST_STD)), ("scale", scale)):
+            self.register_buffer(name, torch.tensor(np.asarray(values), dtype=torch.float32))
+
+
+class DisplacementNet(Scaled):
+    """Residual twist on the best known kinematics; log-variances from a network of their own (gru: a layer)."""
 
     def __init__(
         self, config: NetworkConfig, kinematics: Kinematics, wheel_kinematics: Kinematics, runs: list[Run]
@@ -178,9 +189,7 @@ class DisplacementNet(nn.Module):
         if "velocity" in config.inputs:
             mean = np.append(mean, [0.0, 0.0])
             std = np.append(std, (actual - base)[:, [0, 2]].std(axis=0))
-        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
-        self.register_buffer("std", torch.tensor(np.maximum(std, 1e-3), dtype=torch.float32))
-        self.register_buffer("scale", torch.tensor((actual - base).std(axis=0), dtype=torch.float32))
+        self.scale_by(mean, std, (actual - base).std(axis=0))
         if config.kind == "gru":
             self.trunk: Trunk | nn.Sequential = Trunk(len(config.edges_s) - 1, len(mean), config.hidden)
             self.mean_head = mlp([self.trunk.width, 3])[-1]
@@ -302,35 +311,26 @@ def _linear(net: nn.Sequential) -> list[nn.Linear]:
     return [m for m in net if isinstance(m, nn.Linear)]
 
 
-class NaiveNet(nn.Module):
+class NaiveNet(Scaled):
     """Model without weights: the velocities are the commanded ones, v = u."""
-
-    mean: Tensor
-    std: Tensor
-    scale: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
         """Take the configuration."""
         super().__init__()
         self.config, self.kinematics, self.lag = config, Kinematics(), None
-        for name in ("mean", "std", "scale"):
-            self.register_buffer(name, torch.zeros(0))
+        self.scale_by((), (), ())
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
         """No layers."""
         return []
 
 
-class VelocityNet(nn.Module):
+class VelocityNet(Scaled):
     """[v, ω] a step later from (v, ω, u_v, u_ω, Δt): a lag plus Δt times a network. Source: paper eq. 6, 10.
 
     Of a ``lag`` model there is no network, of an ``arx`` model it is one linear layer, and in the ``rate`` form no lag:
     the network is the acceleration.
     """
-
-    mean: Tensor
-    std: Tensor
-    scale: Tensor
 
     def __init__(self, config: NetworkConfig, kinematics: Kinematics, lag: Lag | None, runs: list[Run]) -> None:
         """Take the normalization from the training runs."""
@@ -345,9 +345,7 @@ class VelocityNet(nn.Module):
         rate = np.maximum(actual.std(axis=0), 1e-3) / (_RATE_S if lag is None else np.array(lag.lag_s))
         if config.kind == "lag":
             mean, std, rate = [], [], np.zeros(0)
-        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
-        self.register_buffer("std", torch.tensor(np.maximum(std, 1e-3), dtype=torch.float32))
-        self.register_buffer("scale", torch.tensor(rate, dtype=torch.float32))
+        self.scale_by(mean, std, rate)
         hidden = () if config.kind == "arx" else config.hidden
         self.net = None if config.kind == "lag" else mlp([5, *hidden, 2])
 

@@ -54,8 +54,8 @@ class Rollout:
     def errors(self, horizon_s: float) -> FloatArray:
         """Right perturbations ``(m, 3)`` that take the predicted to the true end of each window."""
         k, n = self.starts(horizon_s)
-        predicted, actual = relative(self.track[k], self.track[k + n]), relative(self.truth[k], self.truth[k + n])
-        return logs(relative(predicted, actual))
+        predicted, actual = (se2.between_array(poses[k], poses[k + n]) for poses in (self.track, self.truth))
+        return logs(se2.between_array(predicted, actual))
 
     def end_covs(self, horizon_s: float) -> FloatArray:
         """Predicted covariances ``(m, 3, 3)`` at the ends of the windows, the memory of errors accounted for."""
@@ -69,7 +69,8 @@ class Rollout:
         k, n = self.starts(horizon_s)
         cov = np.zeros((len(k), 3, 3))
         for j in range(n):
-            ad = adjoints(inverses(self.motions[k + j]))
+            motion = self.motions[k + j]
+            ad = adjoints(se2.between_array(motion, np.zeros_like(motion)))
             cov = ad @ cov @ ad.transpose(0, 2, 1) + step_covs[k + j]
         return cov
 
@@ -169,18 +170,6 @@ def _roll(run: Run, step_s: float, step: Callable[[int, int], tuple[FloatArray, 
 
 
 # --- SE(2) for many at once -------------------------------------------------------------------------------------------
-
-
-def relative(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``T_a⁻¹ ∘ T_b`` of ``(n, 3)`` poses; the yaw is wrapped."""
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx, se2.wrap_array(b[:, 2] - a[:, 2])])
-
-
-def inverses(poses: FloatArray) -> FloatArray:
-    """``T⁻¹`` of ``(n, 3)`` poses."""
-    return relative(poses, np.zeros_like(poses))
 
 
 def logs(poses: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -376,17 +376,10 @@ def _mean(dumps: list[dict[str, object]]) -> dict[str, object]:
 # --- All models of a configuration ------------------------------------------------------------------------------------
 
 CHECKPOINTS = ".checkpoints"
+Tell = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class Reporter:
-    """Functions for messages: `say` for those on each finished model, `warn` for those on what looks wrong."""
-
-    say: Callable[[str], None]
-    warn: Callable[[str], None]
-
-
-def train_models(config_file: Path, data: Path, out: Path, start: Path | None, reporter: Reporter) -> list[Path]:
+def train_models(config_file: Path, data: Path, out: Path, start: Path | None, say: Tell, warn: Tell) -> list[Path]:
     """Train what a configuration asks for. Interrupted and run again it goes on, and ends at the same files.
 
     Args:
@@ -394,7 +387,8 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, r
         data: folder that the recordings' paths are relative to.
         out: folder of the models; it appears whole.
         start: a model to adapt, instead of training one.
-        reporter: where messages go.
+        say: given a sentence on each finished model.
+        warn: given sentences on what looks wrong.
 
     Returns:
         The models' files.
@@ -421,15 +415,15 @@ def train_models(config_file: Path, data: Path, out: Path, start: Path | None, r
     with atomic_folder(out, own=("*.safetensors", "*.png", CHECKPOINTS)) as stage:
         if start is not None:
             path = stage / "model.safetensors"
-            reporter.say(_figures(path, adapt(start, config, runs, path, f"{made_by}; from {start.name}"), runs))
+            say(_figures(path, adapt(start, config, runs, path, f"{made_by}; from {start.name}"), runs))
         else:
-            _train_all(config, runs, stage, made_by, Checkpoints(out / CHECKPOINTS), reporter)
+            _train_all(config, runs, stage, made_by, Checkpoints(out / CHECKPOINTS), say, warn)
         names = sorted(path.name for path in stage.glob("*.safetensors"))
     return [out / name for name in names]
 
 
 def _train_all(
-    config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints, reporter: Reporter
+    config: TrainConfig, runs: dict[str, Run], out: Path, made_by: str, checkpoints: Checkpoints, say: Tell, warn: Tell
 ) -> None:
     """Train the model of the configuration's split, or one for each recording left out, and one of all."""
     splits = leave_one_out(list(runs)) if config.split is None else [config.split]
@@ -439,19 +433,19 @@ def _train_all(
     found = controls([runs[name] for name in trained], config.limits)
     draw_controls(out / "controls.png", found)
     for missing in found.missing():
-        reporter.warn(f"the recordings hold too little of {missing}")
+        warn(f"the recordings hold too little of {missing}")
     if config.split is not None:
         path = out / "model.safetensors"
-        card = train(config, config.split, runs, path, made_by, checkpoints, reporter.warn)
-        reporter.say(_figures(path, card, runs))
+        card = train(config, config.split, runs, path, made_by, checkpoints, warn)
+        say(_figures(path, card, runs))
         return
     folds = []
     for split in splits:
         path = out / f"without_{split.test[0]}.safetensors"
-        folds.append(train(config, split, runs, path, made_by, checkpoints, reporter.warn))
-        reporter.say(_figures(path, folds[-1], runs))
+        folds.append(train(config, split, runs, path, made_by, checkpoints, warn))
+        say(_figures(path, folds[-1], runs))
     path = out / "all.safetensors"
-    reporter.say(_figures(path, train_on_all(config, runs, folds, path, made_by, checkpoints), {}))
+    say(_figures(path, train_on_all(config, runs, folds, path, made_by, checkpoints), {}))
 
 
 def _check_samples(config: TrainConfig, split: Split, runs: dict[str, Run]) -> None:

@@ -38,26 +38,19 @@ class RenderError(FglocError):
     """No OpenGL to render with."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Exposure:
-    """Time (the middle of the exposure) and settings of an image, known before the robot is there."""
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """Opening time of the shutter, and the settings of the automatic exposure."""
 
-    stamp_s: float
+    start_s: float
     exposure_s: float
     gain: float
     light: float  # 1 is full
-    take: Callable[[], Image]  # the image; once the log reaches beyond the exposure, and in order
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """One image and its time (the middle of the exposure)."""
-
-    stamp_s: float
-    exposure_s: float
-    gain: float
-    light: float  # 1 is full
-    image: Image  # (height, width)
+    @property
+    def stamp_s(self) -> float:
+        """Time of the image: the middle of the exposure."""
+        return self.start_s + 0.5 * self.exposure_s
 
 
 class Renderer:
@@ -125,18 +118,10 @@ class Lens:
         return np.asarray(cv2.remap(radiance, *self._maps, cv2.INTER_LINEAR))
 
 
-def frames(scene: Scene, log: Log) -> Iterator[Frame]:
-    """All images of a finished run, in order.
+def exposures(scene: Scene, log: Log, name: str = FRONT) -> Iterator[tuple[Shot, Callable[[], Image]]]:
+    """All shots of a run, in order, each with the function that renders its image.
 
-    Raises:
-        RenderError: no OpenGL.
-    """
-    for e in exposures(scene, log):
-        yield Frame(e.stamp_s, e.exposure_s, e.gain, e.light, e.take())
-
-
-def exposures(scene: Scene, log: Log, name: str = FRONT) -> Iterator[Exposure]:
-    """All exposures of a run, in order; an image is rendered when it is taken, at the latest before the next exposure.
+    It is to be called once the log reaches beyond the exposure, and before the next shot is asked for.
 
     Raises:
         RenderError: no OpenGL.
@@ -155,19 +140,9 @@ def exposures(scene: Scene, log: Log, name: str = FRONT) -> Iterator[Exposure]:
                 image *= shot.light * shot.gain * shot.exposure_s / camera.exposure_s
                 return _sense(image, camera.noise, shot.gain, rng)
 
-            yield Exposure(shot.start_s + 0.5 * shot.exposure_s, shot.exposure_s, shot.gain, shot.light, take)
+            yield shot, take
     finally:
         renderer.close()
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """Opening time of the shutter, and the settings of the automatic exposure."""
-
-    start_s: float
-    exposure_s: float
-    gain: float
-    light: float  # 1 is full
 
 
 def shots(scene: Scene, log: Log, name: str = FRONT) -> Iterator[Shot]:
@@ -267,7 +242,7 @@ class CornerDetector:
         bright = shot.light * shot.gain * shot.exposure_s / self._camera.exposure_s
         if bright < _LEAST_LIGHT:
             return {}
-        position, quaternion = pose_at(self._log, shot.start_s + 0.5 * shot.exposure_s)
+        position, quaternion = pose_at(self._log, shot.stamp_s)
         R_map_base = quaternion_matrix(quaternion)
         R_map_cam, eye = R_map_base @ self._R_base_cam, position + R_map_base @ self._camera.position
         hidden = {i for ids, begin, end in self._hidden if begin <= shot.start_s < end for i in ids}

@@ -165,9 +165,9 @@ def as_driven(robot: Robot, v: float, omega: float, vy: float = 0.0, steering: f
         vy: to the left [m/s].
         steering: angle of the command before [rad], which a car that is to stand keeps.
     """
-    v, omega = _within(v, robot.max_v), _within(omega, robot.max_omega)
+    v, omega = within(v, robot.max_v), within(omega, robot.max_omega)
     if robot.kind == "mecanum":
-        return Command(v, omega, _within(vy, robot.max_v))
+        return Command(v, omega, within(vy, robot.max_v))
     if robot.kind != "ackermann":
         return Command(v, omega)
     wheelbase = robot.wheelbase_m * robot.wheelbase_scale
@@ -175,7 +175,7 @@ def as_driven(robot: Robot, v: float, omega: float, vy: float = 0.0, steering: f
     if abs(omega) > abs(v) * sharpest:
         v = math.copysign(min(abs(omega) / sharpest, robot.max_v), v)
     if abs(v) > _ROLLS_M_S:
-        steering = _within(math.atan(wheelbase * omega / v), robot.max_steering_rad)
+        steering = within(math.atan(wheelbase * omega / v), robot.max_steering_rad)
     return Command(v, v * math.tan(steering) / wheelbase, 0.0, steering)
 
 
@@ -201,5 +201,6 @@ def steering_angles(robot: Robot, steering: float) -> tuple[float, ...]:
     )
 
 
-def _within(value: float, limit: float) -> float:
+def within(value: float, limit: float) -> float:
+    """The value, or the limit of its sign where it is beyond."""
     return min(max(value, -limit), limit)

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from fgloc import se2
 from fgloc.files.settings import Settings
 from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.types import FloatArray, Landmark, LandmarkMap
@@ -167,7 +168,7 @@ def install(scenario: Scenario, seed: int, landmarks: LandmarkMap) -> Installed:
         believed[name] = true if scenario.installation is None else _misjudged(true, of, errors)
     robot = scenario.robot
     imu = TrueImu(
-        rpy=_triple(np.radians(_normal(seed, errors, "imu_angle_deg", 3))),
+        rpy=se2.triple(np.radians(_normal(seed, errors, "imu_angle_deg", 3))),
         gyro_scale=1.0 + float(_normal(seed, errors, "gyro_scale_share", 1)[0]),
         time_offset_s=_uniform(seed, errors, "imu_time_s"),
     )
@@ -252,7 +253,7 @@ def _mounted(camera: Camera) -> MountedCamera:
     K = intrinsics(camera)
     return MountedCamera(
         position=camera.position,
-        rpy=_triple(np.radians(camera.rpy_deg)),
+        rpy=se2.triple(np.radians(camera.rpy_deg)),
         focal_px=camera.focal_px,
         principal_px=(float(K[0, 2]), float(K[1, 2])),
         distortion=camera.distortion,
@@ -266,7 +267,7 @@ def _misjudged(true: MountedCamera, seed: int, errors: Installation) -> MountedC
     k1 += float(_normal(seed, errors, "distortion_k1", 1)[0])
     k2 += float(_normal(seed, errors, "distortion_k2", 1)[0])
     return MountedCamera(
-        position=_triple(true.position + _normal(seed, errors, "camera_position_m", 3)),
+        position=se2.triple(true.position + _normal(seed, errors, "camera_position_m", 3)),
         rpy=_rpy(rpy_matrix(*true.rpy) @ turn),
         focal_px=true.focal_px * (1.0 + _uniform(seed, errors, "focal_share")),
         principal_px=(true.principal_px[0] + float(off[0]), true.principal_px[1] + float(off[1])),
@@ -298,7 +299,7 @@ def _true_wheels(robot: Robot, seed: int, errors: Installation) -> TrueWheels:
 def _marker(landmark: Landmark) -> Marker:
     x, y, z, w = (float(v) for v in Rotation.from_matrix(landmark.rotation).as_quat())
     return Marker(
-        id=landmark.landmark_id, position=_triple(landmark.position), quaternion=(x, y, z, w), size=landmark.size_m
+        id=landmark.landmark_id, position=se2.triple(landmark.position), quaternion=(x, y, z, w), size=landmark.size_m
     )
 
 
@@ -319,9 +320,4 @@ def _rpy(rotation: FloatArray) -> Vector3:
     """Fixed-axis roll, pitch, yaw [rad] of a rotation matrix."""
     forward = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], forward)
-    return _triple(np.array([np.arctan2(*rotation[2, [1, 2]]), pitch, np.arctan2(*rotation[[1, 0], 0])]))
-
-
-def _triple(values: FloatArray) -> Vector3:
-    x, y, z = (float(v) for v in values)
-    return x, y, z
+    return se2.triple(np.array([np.arctan2(*rotation[2, [1, 2]]), pitch, np.arctan2(*rotation[[1, 0], 0])]))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import mujoco
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fgloc.drives.sides import SkidSteer
 from fgloc.errors import FglocError
-from fgloc.frames import yaw_quaternion
+from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.types import FloatArray, LandmarkMap
 from fgloc_datasets.sim.control import Driver
 from fgloc_datasets.sim.drives import (
@@ -29,6 +29,7 @@ from fgloc_datasets.sim.drives import (
     twists,
     wheel_names,
     wheels,
+    within,
 )
 from fgloc_datasets.sim.installed import Installed, install, survey, true_robot
 from fgloc_datasets.sim.scenario import Robot, Scenario
@@ -69,17 +70,7 @@ class Log:
         return Log(**parts, commands=self.commands, ticks=len(parts["stamps_s"]))
 
 
-_PER_TICK = (
-    "stamps_s",
-    "positions",
-    "quaternions",
-    "velocities",
-    "rates",
-    "wheel_angles",
-    "wheel_rates",
-    "torques",
-    "steering",
-)
+_PER_TICK = tuple(field.name for field in fields(Log) if field.name not in ("commands", "ticks"))
 
 
 class Controller(Protocol):
@@ -269,16 +260,9 @@ class Regulator:
             errors = [sum(errors) / len(errors)] * len(errors)
         out = []
         for i, error in enumerate(errors):
-            self._integrals[i] = _clip(self._integrals[i] + motor.ki * error * dt, supply)
-            out.append(_clip(motor.kp * error + self._integrals[i], supply))
+            self._integrals[i] = within(self._integrals[i] + motor.ki * error * dt, supply)
+            out.append(within(motor.kp * error + self._integrals[i], supply))
         return out
-
-
-def center_of_mass(scene: Scene) -> FloatArray:
-    """Center of mass ``(3,)`` [m] of the whole robot in its base frame, wheels at rest."""
-    data = mujoco.MjData(scene.model)
-    mujoco.mj_forward(scene.model, data)
-    return np.array(data.subtree_com[scene.model.body("base").id])
 
 
 def base_twist(log: Log) -> FloatArray:
@@ -311,11 +295,7 @@ def slipping(log: Log, robot: Robot) -> NDArray[np.bool_]:
 
 def _planar(qpos: FloatArray) -> tuple[float, float, float]:
     w, x, y, z = qpos[3:7]
-    return float(qpos[0]), float(qpos[1]), math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def _clip(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
+    return float(qpos[0]), float(qpos[1]), quaternion_yaw((x, y, z, w))
 
 
 def _slew(now: float, wanted: float, step: float) -> float:

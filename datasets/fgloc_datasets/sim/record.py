@@ -6,7 +6,6 @@ import heapq
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -228,9 +227,7 @@ def jobs(suite: Suite, longest_s: float | None = None) -> list[Job]:
     return sorted(out, key=lambda job: -job.scenario.duration_s)
 
 
-def record_suite(
-    todo: list[Job], out: Path, camera: bool, workers: int, said: Callable[[str], None] = lambda _: None
-) -> int:
+def record_suite(todo: list[Job], out: Path, camera: bool, workers: int) -> int:
     """Record runs in ``workers`` processes. Runs that ``out`` already holds are skipped, so a killed suite resumes.
 
     Args:
@@ -238,7 +235,6 @@ def record_suite(
         out: a folder for the suite; each run gets its own below it.
         camera: render images.
         workers: processes.
-        said: told of each run that was recorded.
 
     Returns:
         How many runs were recorded now.
@@ -252,12 +248,10 @@ def record_suite(
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool:
         futures = {pool.submit(record, j.scenario, j.seed, out / j.folder, camera): j for j in left}
         for future in counted(as_completed(futures), "recording", len(left), "runs"):
-            folder = futures[future].folder
             try:
                 future.result()
-                said(folder)
             except FglocError as error:
-                failed.append(f"  {folder}: {error}")
+                failed.append(f"  {futures[future].folder}: {error}")
     if failed:
         raise SimulationError(f"{len(failed)} of {len(left)} runs failed:\n" + "\n".join(failed))
     return len(left)

@@ -24,7 +24,7 @@ from fgloc.frames import quaternion_matrix, rpy_matrix
 from fgloc.types import FloatArray, IntArray
 from fgloc_datasets.bag import BagWriter
 from fgloc_datasets.convert import Message
-from fgloc_datasets.sim.camera import CornerDetector, Exposure, Shot, exposures, light_level, shots
+from fgloc_datasets.sim.camera import CornerDetector, Image, Shot, exposures, light_level, shots
 from fgloc_datasets.sim.drives import Command, believed, steering_names, twists, wheel_names
 from fgloc_datasets.sim.installed import camera_jitter_s
 from fgloc_datasets.sim.physics import TICK_S, Log, Scene, base_twist, slipping, wheel_twist
@@ -298,7 +298,9 @@ def streams(scene: Scene, log: Log, bag: BagWriter, camera: Sees) -> list[Iterat
         channels.append(_fixes(scene, scene.scenario.gnss, log, bag))
     if camera != "nothing" and scene.scenario.camera is not None:
         send = _images if camera == "images" else _corners
-        channels += [_mounting(scene, bag), *(send(scene, log, bag, name) for name in scene.scenario.cameras)]
+        channels.append(_mounting(scene, bag))
+        names = scene.scenario.cameras
+        channels += [_with_lens(scene, log, bag, name, send(scene, log, bag, name)) for name in names]
     return channels
 
 
@@ -474,62 +476,52 @@ def _mounting(scene: Scene, bag: BagWriter) -> Iterator[Message]:
         )
 
 
-def _images(scene: Scene, log: Log, bag: BagWriter, name: str) -> Iterator[Message]:
-    """Messages of images, each with the believed calibration of the camera."""
-    camera = scene.scenario.cameras[name]
-    quality = [cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    arrive = _Arrival(scene, log, name)
-    for exposure in exposures(scene, log, name):
-        stamp, received = arrive.of(exposure.stamp_s, exposure.exposure_s)
+Sent = Iterator[tuple[Shot, Callable[[int, int], None]]]  # shots, and what writes their message of a stamp and receipt
 
-        def write(exposure: Exposure = exposure, stamp: int = stamp, received: int = received) -> None:
-            data = cv2.imencode(".jpg", exposure.take(), quality)[1].tobytes()
+
+def _images(scene: Scene, log: Log, bag: BagWriter, name: str) -> Sent:
+    """Images of a camera."""
+    quality = [cv2.IMWRITE_JPEG_QUALITY, scene.scenario.cameras[name].jpeg_quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    for shot, take in exposures(scene, log, name):
+
+        def write(stamp: int, received: int, take: Callable[[], Image] = take) -> None:
+            data = cv2.imencode(".jpg", take(), quality)[1].tobytes()
             topic = f"/{name}/image/compressed"
             bag.compressed_image(topic, stamp, data, received_ns=received, frame_id=f"{name}_optical")
 
-        yield received, partial(_write_lens, scene, bag, name, stamp, received)
-        yield received, write
+        yield shot, write
 
 
-def _corners(scene: Scene, log: Log, bag: BagWriter, name: str) -> Iterator[Message]:
-    """Messages of corners that a detector finds without rendering, each with the believed calibration of the camera."""
-    detector, arrive = CornerDetector(scene, log, name), _Arrival(scene, log, name)
+def _corners(scene: Scene, log: Log, bag: BagWriter, name: str) -> Sent:
+    """Corners that a detector finds without rendering."""
+    detector = CornerDetector(scene, log, name)
     for shot in shots(scene, log, name):
-        stamp, received = arrive.of(shot.start_s + 0.5 * shot.exposure_s, shot.exposure_s)
 
-        def write(shot: Shot = shot, stamp: int = stamp, received: int = received) -> None:
+        def write(stamp: int, received: int, shot: Shot = shot) -> None:
             seen, frame = detector.find(shot), f"{name}_optical"
             bag.corners(f"/{name}/corners", stamp, seen, received_ns=received, frame_id=frame)
 
-        yield received, partial(_write_lens, scene, bag, name, stamp, received)
-        yield received, write
+        yield shot, write
 
 
-class _Arrival:
-    """Stamps and receive times of a camera's messages, in order; the clock of the stamps may be late."""
-
-    def __init__(self, scene: Scene, log: Log, name: str) -> None:
-        camera, late_s = scene.scenario.cameras[name], scene.installed.true_camera(name).time_offset_s
-        self._rng = channel_rng(scene.seed, f"latency of {name}")
-        n = round(log.stamps_s[-1] * camera.rate_hz) + 1
-        seed = scene.seed if name == FRONT else scene.seed + 1
-        self._late_s = iter(late_s + camera_jitter_s(scene.scenario.installation, seed, n))
-        self._latency = scene.scenario.latency.camera
-        self._stamp = self._received = 0
-
-    def of(self, taken_s: float, exposure_s: float) -> tuple[int, int]:
-        """Stamp and receive time [ns] of the next exposure, by its middle and its length."""
-        taken, (least, mean) = stamp_ns(taken_s), self._latency
-        self._stamp = max(taken + round(1e9 * next(self._late_s)), self._stamp + 1)
-        received = taken + round(1e9 * (0.5 * exposure_s + least + self._rng.exponential(mean)))
-        self._received = max(received, self._received)
-        return self._stamp, self._received
-
-
-def _write_lens(scene: Scene, bag: BagWriter, name: str, stamp: int, received: int) -> None:
-    camera, believed = scene.scenario.cameras[name], scene.installed.believed_camera(name)
-    size, topic, frame = (camera.width, camera.height), f"/{name}/camera_info", f"{name}_optical"
-    bag.camera_info(topic, stamp, size, believed.matrix, believed.distortion, received_ns=received, frame_id=frame)
+def _with_lens(scene: Scene, log: Log, bag: BagWriter, name: str, sent: Sent) -> Iterator[Message]:
+    """Messages of a camera, before each the calibration that is believed; the clock of the stamps may be late."""
+    camera, late_s = scene.scenario.cameras[name], scene.installed.true_camera(name).time_offset_s
+    believed, frame = scene.installed.believed_camera(name), f"{name}_optical"
+    lens = ((camera.width, camera.height), believed.matrix, believed.distortion)
+    rng = channel_rng(scene.seed, f"latency of {name}")
+    n = round(log.stamps_s[-1] * camera.rate_hz) + 1
+    seed = scene.seed if name == FRONT else scene.seed + 1
+    late = iter(late_s + camera_jitter_s(scene.scenario.installation, seed, n))
+    least, mean = scene.scenario.latency.camera
+    stamp = received = 0
+    for shot, write in sent:
+        taken = stamp_ns(shot.stamp_s)
+        stamp = max(taken + round(1e9 * next(late)), stamp + 1)
+        received = max(taken + round(1e9 * (0.5 * shot.exposure_s + least + rng.exponential(mean))), received)
+        told = partial(bag.camera_info, f"/{name}/camera_info", stamp, *lens, received_ns=received, frame_id=frame)
+        yield received, told
+        yield received, partial(write, stamp, received)
 
 
 def _messages(received: Sequence[int], *write: Callable[[int, int], None]) -> Iterator[Message]:

@@ -20,7 +20,7 @@ from fgloc.live import Live, LivePose, LiveStatus
 from fgloc.live.live import TYPED_SIGMAS
 from fgloc.live.process import EstimationProcess
 from fgloc.live.run import LOOK, MOTION
-from fgloc.live.wire.outputs import BaseState, OdomFrame, Outputs, RecentPoses, odom_in_map
+from fgloc.live.wire.outputs import OdomFrame, Outputs, RecentPoses, odom_in_map
 from fgloc.live.wire.transport import Clock, Publication, Received, Transport
 from fgloc.recording.reader import TF_TYPES, MessageEvents, TopicInfo, select_roles, topic_key
 from fgloc.recording.standard_messages import MAP_FRAME
@@ -425,7 +425,7 @@ class Node:
             self._recent.add(now)
         self._last = now
         base = self._odom.base
-        self._outputs.odometry(BaseState(now.stamp_ns, now.pose, now.cov, *self._recent.twist(), now.ground), base)
+        self._outputs.odometry(now, *self._recent.twist(), base)
         self.published["odometry"] += 1
         if self._as.tf:
             self._publish_transforms(now, base)

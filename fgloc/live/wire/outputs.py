@@ -16,7 +16,7 @@ from fgloc.frames import BASE_NAMES, quaternion_yaw
 from fgloc.live import LivePose
 from fgloc.live.wire.transport import Transport
 from fgloc.recording import standard_messages as standard
-from fgloc.types import Estimate, Event, FloatArray, Ground, LandmarkMap, Mode, MotionEvent, TransformEvent
+from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Mode, MotionEvent, TransformEvent
 
 # --- The robot's own odometry frame, which ``map → odom`` leads to (REP 105) ------------------------------------------
 
@@ -208,18 +208,6 @@ def _body_cov(pose: LivePose) -> FloatArray:
 # --- Messages ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BaseState:
-    """Pose and twist of the base at a time."""
-
-    stamp_ns: int
-    pose: FloatArray  # (3,) T_map_base
-    cov: FloatArray  # (3, 3) in the map frame
-    twist: FloatArray  # (3,) of the base in its own axes: m/s, m/s, rad/s
-    twist_cov: FloatArray  # (3, 3) likewise
-    ground: Ground | None = None  # None: the floor is flat
-
-
 class Outputs:
     """Writers of everything that a live run publishes."""
 
@@ -251,17 +239,10 @@ class Outputs:
         """Number of readers of one of the `TYPES`."""
         return self._writers[topic].readers
 
-    def odometry(self, state: BaseState, base_frame: str) -> None:
-        """Publish nav_msgs/Odometry of the base in the map."""
+    def odometry(self, now: LivePose, twist: FloatArray, twist_cov: FloatArray, base_frame: str) -> None:
+        """Publish nav_msgs/Odometry of the base in the map, with the twist as `RecentPoses.twist` has it."""
         values = standard.odometry(
-            state.stamp_ns,
-            state.pose,
-            state.cov,
-            state.twist,
-            base_frame,
-            state.twist_cov,
-            state.ground,
-            frame=self._frame,
+            now.stamp_ns, now.pose, now.cov, twist, base_frame, twist_cov, now.ground, frame=self._frame
         )
         self._writers["~/odometry"].publish(values)
 

@@ -16,7 +16,7 @@ from itertools import count
 from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import yaml
@@ -27,7 +27,7 @@ from fgloc.ablation.suite import FailureEntry
 from fgloc.config import Config, Role, config_of
 from fgloc.errors import ConfigError, EstimatorError
 from fgloc.files.atomic import atomic_folder
-from fgloc.files.settings import sentences
+from fgloc.files.settings import merged, sentences
 from fgloc.live import Live
 from fgloc.recording.reader import MessageEvents
 from fgloc.sensors.failures import Failure
@@ -135,19 +135,6 @@ _CHANGES: dict[PoseName, dict[str, Any]] = {
 }
 
 
-class PoseSource(Protocol):
-    """Interface of an estimator that takes the robot's messages as they arrive and gives its pose."""
-
-    def push(self, event: Event) -> None:
-        """Add an event, in order of receipt."""
-
-    def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
-        """Pose ``(3,)`` (None: not known) and the standard deviation of its position in the worst direction [m]."""
-
-    def close(self) -> None:
-        """End the estimation."""
-
-
 class TruePose:
     """The true pose, for comparison."""
 
@@ -182,7 +169,10 @@ class LivePose:
         self._live.push(event)
 
     def pose(self, stamp_ns: int, truth: FloatArray) -> tuple[FloatArray | None, float]:
-        """Newest pose, propagated to the stamp; None where the robot is lost."""
+        """Newest pose ``(3,)``, propagated to the stamp; None where the robot is lost.
+
+        With it the standard deviation of its position in the worst direction [m].
+        """
         if not self._live.wait(_PATIENCE_S):
             raise EstimatorError(f"the live run did not use its events within {_PATIENCE_S:.0f} s")
         known = self._live.pose_at(stamp_ns)
@@ -194,6 +184,9 @@ class LivePose:
     def close(self) -> None:
         """End the threads of the live run."""
         self._live.close()
+
+
+PoseSource = TruePose | LivePose
 
 
 def pose_source(
@@ -222,11 +215,6 @@ def pose_source(
 
 def changed(config: Config, changes: dict[str, Any]) -> Config:
     """The configuration with some of its values replaced, given as nested mappings."""
-
-    def merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-        inner = {k: merged(old.get(k) or {}, v) if isinstance(v, dict) else v for k, v in new.items()}
-        return {**old, **inner}
-
     return config_of(merged(config.model_dump(exclude_unset=True), changes))
 
 
