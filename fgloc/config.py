@@ -56,6 +56,13 @@ class NoiseDensity(Section):
     xy_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="m/√s")
     yaw_per_sqrt_s: float = expert(0.002, ge=0, le=100, description="rad/√s")
 
+    def per_second(self, v: float, omega: float) -> tuple[float, float, float]:
+        """Variances per second of x, y, yaw at a velocity [m/s, rad/s]."""
+        v, omega = abs(v), abs(omega)
+        turning = self.xy_per_sqrt_rad**2 * omega + self.xy_per_sqrt_s**2
+        yaw = self.yaw_per_sqrt_m**2 * v + self.yaw_per_sqrt_rad**2 * omega + self.yaw_per_sqrt_s**2
+        return self.x_per_sqrt_m**2 * v + turning, self.y_per_sqrt_m**2 * v + turning, yaw
+
 
 _LEAST_SCALE = 1e-3
 _LEAST_RADIUS = 1e-6  # m: of a way per tick

@@ -354,10 +354,7 @@ class GaussianSum:
 
     def _misread_density(self, m: PointMeasurement, R: FloatArray) -> FloatArray:
         """Log likelihood ``(n,)`` of a sighting whose id is wrong: of any other beacon, or of nothing in the map."""
-        c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
-        x, y = m.point
-        points = self.poses[:, :2] + np.column_stack([c * x - s * y, s * x + c * y])
-        off = points[:, None] - self.places
+        off = se2.placed(self.poses, m.point)[:, None] - self.places
         distances = np.einsum("nld,nld->nl", off, off)
         distances[:, self._index[m.landmark_id]] = np.inf
         residual, J = residuals(self.poses, self.places[distances.argmin(1)], m)

@@ -74,11 +74,6 @@ class OdometriesBeside:
         self._states = {source.name: _State(GlrTest(config)) for source in sources}
         self._readings: dict[str, BesideReading] = {}
 
-    @property
-    def factors_on_covariance(self) -> dict[str, float]:
-        """Estimated true over reported covariance of each source that was compared."""
-        return {s.name: s.scale.factor for s in self._sources if self._states[s.name].compared_s >= _LEARNED_S}
-
     def begin_segment(self) -> None:
         """Forget all messages, as nothing connects them with those to come."""
         for source in self._sources:
@@ -181,13 +176,15 @@ class OdometriesBeside:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user: covariances that are too small, and sources that were not used."""
-        found = []
-        for name, factor in self.factors_on_covariance.items():
-            if factor > COVARIANCE_FACTOR:
-                found.append(f"the covariance of {name} is taken times {factor:.2g}, as it differs from the others")
+        compared = [source for source in self._sources if self._states[source.name].compared_s >= _LEARNED_S]
+        found = [
+            f"the covariance of {source.name} is taken times {source.scale.factor:.2g}, as it differs from the others"
+            for source in compared
+            if source.scale.factor > COVARIANCE_FACTOR
+        ]
         found += [
             f"{source.name} was not used: it drove beside the other sources for less than {_LEARNED_S:g} s"
             for source in self._sources
-            if self._states[source.name].compared_s < _LEARNED_S
+            if source not in compared
         ]
         return tuple(found)

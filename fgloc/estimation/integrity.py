@@ -209,7 +209,9 @@ class ProtectionLevels:
         bound, cause = self._least(sound, faults)
         if bound[2] > 0.5 * math.pi:  # nobody knows which way is along: what lies there may lie across
             bound = np.array([*np.maximum(bound[:2], bound[3]), min(float(bound[2]), math.pi), bound[3]])
-        return Protection(bound[:3], float(bound[3]), cause, self._is_alert(float(bound[3]), float(bound[2])))
+        limits = (self._config.alert_m, float(bound[3])), (self._config.alert_yaw_rad, float(bound[2]))
+        alert = any(limit is not None and level > limit for limit, level in limits)
+        return Protection(bound[:3], float(bound[3]), cause, alert)
 
     def _slip(
         self, speed: FloatArray, since_fix_s: float, checked: bool, slips_per_s: float, fix: Fix | None
@@ -269,10 +271,6 @@ class ProtectionLevels:
             low, high = np.where(over, middle, low), np.where(over, high, middle)
         causes = beyond(high)[:, 3]
         return high, ["noise", *(fault.name for fault in faults)][int(np.argmax(causes))]
-
-    def _is_alert(self, position_m: float, yaw_rad: float) -> bool:
-        limit, yaw = self._config.alert_m, self._config.alert_yaw_rad
-        return (limit is not None and position_m > limit) or (yaw is not None and yaw_rad > yaw)
 
 
 def _tails(gap: FloatArray, sigma: FloatArray) -> FloatArray:

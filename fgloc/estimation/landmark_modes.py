@@ -500,8 +500,7 @@ class LandmarkModes:
             return belief
         known = self._known(belief)
         pose, P = se2.compose(belief.pose, se2.exp(off[:3])), joint_cov(belief, known) + spread
-        installation = InstallationEstimate(known.mean + off[3:], P[3:, 3:])
-        return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], installation)
+        return PoseWithCovariance.jointly(pose, known.mean + off[3:], P)
 
     def exclude_if_moved(self, landmark_id: int, moved: FloatArray, evidence: float) -> bool:
         """Leave out a landmark that a search found to be moved, if that is far and clear enough; whether it is."""

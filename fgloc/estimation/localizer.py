@@ -169,18 +169,18 @@ class Localizer:
         known, self._restart = self._restart, None
         self._recorder.begin_segment(told=known is not None)
         self.motion.begin_segment(step)
-        self.sightings.begin_segment()
+        self.sightings.association.begin_segment()
         self._prior = self.tracking.begin_segment(self.estimator.belief, known)
 
     def _begin(self, step: Step, readings: MotionReadings, sightings: Sequence[LandmarkMeasurement]) -> Estimate | None:
         """Process a step while the pose is searched for; return its estimate, if there is one already."""
         if self._prior is not None:
             prior, self._prior = self._prior, None  # it does not hold once the robot got lost
-            self.tracking.start_known()
+            self.tracking.global_search.initializing = False
             return self._start(step, prior, sightings)
         motions = self.motion.combine(step, readings)
         self.estimator.level(motions)
-        found = self.tracking.collect(step, motions, sightings, readings)
+        found = self.tracking.global_search.collect(step, motions, sightings, readings)
         if found is None and self.tracking.lost:
             return self._advance(step, readings, ())
         if found is None:
@@ -198,7 +198,7 @@ class Localizer:
             self.tracking.found(before, place)
         self.estimator.forget_contradictions()
         self.motion.restart()
-        self.sightings.restart()
+        self.sightings.association.forget_contradictions()
         self._recorder.jumped()
         decisions = [*decisions, *self.sightings.exclude_displaced(self.estimator.k + 1, step, found)]
         estimate = self._start(step, place, ())
@@ -364,7 +364,7 @@ class Recorder:
         twist = self._compensation.twist(step, step.stamp_ns)
         clock_variance = self._clock_sigma_s**2 + self._motion.sources.clock_sigma_s(frame) ** 2
         by_clock = np.asarray(np.outer(twist, twist) * clock_variance)
-        carried, around = tracking.kidnapped(self._sightings.contradicting, belief)
+        carried, around = tracking.kidnapped(self._sightings.association.contradicting, belief)
         frame.added_cov = by_clock
         frame.carried_cov = carried * around  # of a mixture of two Gaussians, the second one wide
         if frame.mode is Mode.LOST:

@@ -421,13 +421,17 @@ _KNOCK_LANDMARKS, _KNOCK_IMAGES = 2, 3  # at least in an image, and such images 
 
 
 class SightingJudge:
-    """Holds the sightings of each step against the predicted pose."""
+    """Holds the sightings of each step against the predicted pose.
+
+    Attributes:
+        association: the gate, with what it remembers.
+    """
 
     def __init__(self, config: Config, estimator: Estimator, tracking: Tracking) -> None:
         """Set up for the estimator that predicts the pose, and the tracking that searches for it."""
         self._estimator = estimator
         self._tracking = tracking
-        self._association = Association(config, estimator.factors)
+        self.association = Association(config, estimator.factors)
         self._rejections: Counter[str] = Counter()
         self._adaptive, self._gate = config.weights.adaptive, config.estimator.gate_probability
         self._remounted: dict[str, int] = {}  # stamp of the first sightings since then, by their kind
@@ -438,30 +442,17 @@ class SightingJudge:
     @property
     def modes(self) -> LandmarkModes:
         """Hypotheses of moved landmarks."""
-        return self._association.modes
+        return self.association.modes
 
     @property
     def rejections(self) -> Counter[str]:
         """Number of sightings that were not used so far, by reason."""
-        return self._rejections + self._association.rejections
+        return self._rejections + self.association.rejections
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user about moved landmarks and knocked sensors."""
         return (*moved_notes(self.modes.displacements), *mounting_notes(self._remounted))
-
-    @property
-    def contradicting(self) -> int:
-        """How many landmarks were rejected since a sighting was accepted."""
-        return self._association.contradicting
-
-    def begin_segment(self) -> None:
-        """Forget when landmarks were seen last, as the clock jumped."""
-        self._association.begin_segment()
-
-    def restart(self) -> None:
-        """Forget contradictions, as the robot was found at another place."""
-        self._association.forget_contradictions()
 
     def judge(
         self, step: Step, sightings: Sequence[LandmarkMeasurement], motion: JudgedMotion
@@ -514,7 +505,7 @@ class SightingJudge:
                 continue
             self._refused[kind] = count + 1, since_ns, found[0].installation
             if count + 1 == _KNOCK_IMAGES:
-                self._association.take_back((m, "gate") for m in own)
+                self.association.take_back((m, "gate") for m in own)
                 return kind, since_ns, sum(nis[kind, m.landmark_id] for m in own), now
         return None
 
@@ -533,7 +524,9 @@ class SightingJudge:
         seen = self.associate(step, sightings, predicted)
         if seen.accepted:
             return motion, seen
-        outliers = [m for m in (s.measurement for s in seen.rejected) if self._may_tell_place(m)]
+        # The search judges by itself whether a beacon was moved
+        rejected = [s.measurement for s in seen.rejected]
+        outliers = [m for m in rejected if m.is_point or not self.modes.excludes(m.landmark_id)]
         found = self._tracking.search(step, motion.factors, outliers, motion.readings, predicted)
         if found is not None and self._tracking.keeps_initial_pose:
             self._tracking.record_conflict(predicted, found.newest)
@@ -541,7 +534,7 @@ class SightingJudge:
             return motion, replace(seen, places=(row,))
         if found is not None or self._tracking.keeps_initial_pose:
             return motion, replace(seen, elsewhere=found)
-        fit = self._association.nearby_consensus(seen.rejected, seen.decisions, predicted)
+        fit = self.association.nearby_consensus(seen.rejected, seen.decisions, predicted)
         if fit is None:
             return motion, seen
         nearby = PoseWithCovariance(fit.pose, fit.cov)
@@ -555,15 +548,11 @@ class SightingJudge:
         seen = self.associate(step, sightings, self._estimator.predict(motion.factors))
         return motion, replace(seen, places=(row,))
 
-    def _may_tell_place(self, m: LandmarkMeasurement) -> bool:
-        """Whether the search may know of a rejected sighting: it judges by itself whether a beacon was moved."""
-        return m.is_point or not self.modes.excludes(m.landmark_id)
-
     def associate(
         self, step: Step, sightings: Sequence[LandmarkMeasurement], predicted: PoseWithCovariance
     ) -> JudgedSightings:
         """Accept or reject each sighting against one pose; against a given first pose that holds, reject all."""
-        judged = self._association.judge(self._estimator.k + 1, step.stamp_ns, sightings, predicted)
+        judged = self.association.judge(self._estimator.k + 1, step.stamp_ns, sightings, predicted)
         accepted, rejected, decisions = self._tracking.gate_initial_pose(*judged)
         if held := sum(d.reason == CONTRADICTS for d in decisions):
             self._rejections["sightings.contradict_initial_pose"] += held

@@ -30,6 +30,7 @@ class Tracking:
     is wrong, only the user can decide. They are rejected and reported.
 
     Attributes:
+        global_search: on the whole map.
         lost: nothing explains where the robot is.
         initial_pose_conflict: pose ``(3,)`` at which sightings put the robot, in the frame of the given first pose that
             they contradict; None: they did not.
@@ -42,7 +43,7 @@ class Tracking:
         self._config = config.estimator
         self._adaptive = config.weights.adaptive and factors.known
         self._known, self.installation = factors.known, factors.installation
-        self._search = GlobalSearch(config, landmark_map, factors, keep_all)
+        self.global_search = GlobalSearch(config, landmark_map, factors, keep_all)
         self.lost = False
         self.initial_pose_conflict: FloatArray | None = None
         self._clock_s = self._fix_s = 0.0
@@ -51,7 +52,7 @@ class Tracking:
         self._jump: FloatArray | None = None  # the first one ...
         self._jump_count = 0  # ... of so many
         self._reported = False  # whether an unconfirmed pose was reported
-        self._places = self._search.hypotheses.places
+        self._places = self.global_search.hypotheses.places
         self._never_found = False
 
     def begin_segment(
@@ -64,7 +65,7 @@ class Tracking:
             known: where it starts, by the user or an earlier run.
         """
         self.lost = self._given = self._reported = False
-        self._search.reset()
+        self.global_search.reset()
         if known is not None:
             return known
         given = self._config.initial_pose
@@ -96,7 +97,7 @@ class Tracking:
     @property
     def initializing(self) -> bool:
         """Whether the pose is looked for on the whole map."""
-        return self._search.initializing
+        return self.global_search.initializing
 
     @property
     def mode(self) -> Mode:
@@ -133,7 +134,7 @@ class Tracking:
         self._fix_s = self._clock_s
         if by_sightings:
             self.lost = False
-            self._search.forget()
+            self.global_search.forget()
 
     def record_conflict(self, predicted: PoseWithCovariance, place: PoseWithCovariance) -> None:
         """Note that sightings agree on another place than the given one."""
@@ -171,8 +172,8 @@ class Tracking:
     def get_lost(self) -> None:
         """Look for the robot anywhere on the map."""
         self.lost = True
-        self._search.initializing = True
-        self._search.hypotheses.reset()
+        self.global_search.initializing = True
+        self.global_search.hypotheses.reset()
 
     def is_unlocalized(self, belief: PoseWithCovariance | None) -> bool:
         """Whether the pose is so little known that only a search of the map can find it again."""
@@ -182,26 +183,12 @@ class Tracking:
         # Twice the variance with which a place is taken, so that one just taken is not lost at once
         return bool(max(x, y) > _NOWHERE_M or yaw**2 > 2.0 * MAX_SIGMA[2] ** 2)
 
-    def start_known(self) -> None:
-        """End the search, as the pose is known."""
-        self._search.initializing = False
-
-    def collect(
-        self,
-        step: Step,
-        motions: Sequence[MotionMeasurement],
-        sightings: Sequence[LandmarkMeasurement],
-        readings: MotionReadings,
-    ) -> InitialPose | None:
-        """While initializing: add a step; the start once it is clear."""
-        return self._search.collect(step, motions, sightings, readings)
-
     def unconfirmed(self) -> PoseWithCovariance | None:
         """Pose by the sightings so far, before they are enough to check one another; None: it is too uncertain.
 
         Reported once the pose is known well enough to judge a sighting by it.
         """
-        belief = self._search.hypotheses.belief()
+        belief = self.global_search.hypotheses.belief()
         if belief is None or (not self._reported and self.is_unlocalized(belief)):
             return None
         self._reported = True
@@ -215,8 +202,8 @@ class Tracking:
         """
         if not self.initializing or self.lost:
             return None
-        belief = self._search.hypotheses.belief()
-        start = self._search.give_up() if no_landmark_sensor or belief is not None else None
+        belief = self.global_search.hypotheses.belief()
+        start = self.global_search.give_up() if no_landmark_sensor or belief is not None else None
         if start is not None and (belief is None or self.is_unlocalized(belief)):
             self._never_found = True
             self.get_lost()
@@ -236,11 +223,11 @@ class Tracking:
             A place found from two landmarks or more, and far from the predicted one: nearer ones are the business of
             `Association.nearby_consensus`, unless the first pose was given.
         """
-        searching = bool(outliers) or self._search.searching
+        searching = bool(outliers) or self.global_search.searching
         decided = self.keeps_initial_pose and self.initial_pose_conflict is not None
         if not searching or decided or self.initializing or not self._adaptive:
             return None
-        started = self._search.collect(step, motions, outliers, readings, predicted)
+        started = self.global_search.collect(step, motions, outliers, readings, predicted)
         if started is None or self.keeps_initial_pose or started.gathered:
             return started  # what is gathered has no consensus nearby: that may need all of the collected time
         return started if apart(predicted.pose, started.newest.pose) else None
@@ -251,7 +238,7 @@ class Tracking:
         if self._jump is None:
             self._jump = se2.between(estimated.pose, place.pose)
         self.lost = self._given = False
-        self._search.forget()
+        self.global_search.forget()
 
     @property
     def notes(self) -> tuple[str, ...]:

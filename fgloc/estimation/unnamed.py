@@ -296,9 +296,7 @@ class Constellations:
             seen = points[j[k]] - points[i[k]]
             yaws = np.arctan2(known[a, b, 1], known[a, b, 0]) - math.atan2(seen[1], seen[0])
             middle = 0.5 * (points[i[k]] + points[j[k]])
-            c, s = np.cos(yaws), np.sin(yaws)
-            at = 0.5 * (self._places[a] + self._places[b])
-            at = at - np.column_stack([c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]])
+            at = 0.5 * (self._places[a] + self._places[b]) - se2.turned(middle, yaws)
             made.append(np.column_stack([at, yaws]))
         poses = np.concatenate(made) if made else np.zeros((0, 3))
         off = self._tree.query(_seen_from(poses, points).reshape(-1, 2))[0].reshape(len(poses), len(points))

@@ -18,7 +18,15 @@ from fgloc import se2
 from fgloc.config import BatchConfig
 from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.batch_factors import BatchMotions, BatchSightings, GroundMotions
-from fgloc.graph.factors import INSTALLATION, LandmarkFactors, ground_key, landmark_key, pose_key, prior_factor
+from fgloc.graph.factors import (
+    INSTALLATION,
+    LandmarkFactors,
+    ground_key,
+    landmark_key,
+    pose_key,
+    pose_vector,
+    prior_factor,
+)
 from fgloc.graph.installation import GROUND, InstallationEstimate
 from fgloc.graph.joint import MOST_STEPS, fuse
 from fgloc.graph.measurement_log import Keyframe, LoggedSighting, MeasurementLog
@@ -361,7 +369,7 @@ class BatchSmoother:
         """Smoothed poses ``(n, 3)``."""
         if self._factors.known:  # then no other pose is among the values
             return np.asarray(gtsam.utilities.extractPose2(self._values))
-        return np.array([_vector(self._values.atPose2(pose_key(frame.k))) for frame in self.frames])
+        return np.array([pose_vector(self._values.atPose2(pose_key(frame.k))) for frame in self.frames])
 
     def installed(self) -> InstallationEstimate:
         """The installation that the last solution has found; on uneven ground with that under the last keyframe."""
@@ -609,7 +617,3 @@ def _nis(sighting: LoggedSighting, values: gtsam.Values) -> float:
 
 def _dof(sighting: LoggedSighting) -> int:
     return 0 if sighting.factor is None else sighting.factor.dim()
-
-
-def _vector(pose: gtsam.Pose2) -> FloatArray:
-    return np.array([pose.x(), pose.y(), pose.theta()])

@@ -16,9 +16,9 @@ from fgloc.errors import CovarianceError, EstimatorError
 from fgloc.graph.factors import (
     INSTALLATION,
     LandmarkFactors,
+    ground_key,
     installed_motion_factor,
     motion_factor,
-    of_ground,
     pose_key,
     sighting_factors,
 )
@@ -26,7 +26,7 @@ from fgloc.graph.ground import gravity, gravity_factor, ground_prior, step_facto
 from fgloc.graph.installation import GROUND, Installation
 from fgloc.graph.measurement_log import Keyframe, LoggedSighting
 from fgloc.graph.noise import whitening_of
-from fgloc.graph.observation import Linearized, Lines, Observations, Stacked
+from fgloc.graph.observation import Lines, Observations, Stacked
 from fgloc.types import FloatArray, IntArray
 
 _WHEELS_CAUCHY_K = 3.0  # sigmas, as of sightings in fits of a pose
@@ -206,11 +206,10 @@ class _Images:
         flat, flat_top = others.reshape(-1, others.shape[2]), top.reshape(-1, others.shape[2])
         rest += flat.T @ flat - flat_top.T @ flat_top
         noise = gtsam.noiseModel.Unit.Create(R.shape[1])
-        keys = [pose_key(k) for k in self._k[first].tolist()]
-        for key, by_pose, by_rest in zip(keys, R, top, strict=True):
-            blocks: list[Any] = [key, by_pose[:, :3]]
+        for k, by_pose, by_rest in zip(self._k[first].tolist(), R, top, strict=True):
+            blocks: list[Any] = [pose_key(k), by_pose[:, :3]]
             if d > 3:
-                blocks += [of_ground(key), by_pose[:, 3:]]
+                blocks += [ground_key(k), by_pose[:, 3:]]
             if self._installation.constants:
                 blocks += [INSTALLATION, by_rest[:, :-1]]
             linear = gtsam.JacobianFactor(*blocks, -by_rest[:, -1], noise)  # type: ignore[call-overload]
@@ -224,18 +223,12 @@ class _Images:
         for start, end in pairwise(bounds):
             sightings, there, some = self._sightings[start:end], theta, lines[start:end]
             if ground.shape[1]:
-                there = np.concatenate([theta, ground[start]])
-                some = self._of_keyframe(sightings, own[start], there)
+                there, measurements = np.concatenate([theta, ground[start]]), [s.measurement for s in sightings]
+                some = Observations(measurements, self._landmarks, self._installation).linearize(own[start], there)
             ahead = [i for i, one in enumerate(some) if not one.behind]
             if ahead:
                 kept = [sightings[i] for i in ahead], Lines.of([some[i] for i in ahead], len(there))
                 yield from sighting_factors(int(self._k[start]), *kept, own[start], there, constants)
-
-    def _of_keyframe(
-        self, sightings: Sequence[LoggedSighting], pose: FloatArray, theta: FloatArray
-    ) -> list[Linearized]:
-        measurements = [s.measurement for s in sightings]
-        return Observations(measurements, self._landmarks, self._installation).linearize(pose, theta)
 
 
 def _rows(chosen: IntArray, stack: Stacked, n: int) -> FloatArray:

@@ -166,9 +166,7 @@ def spread(held: FloatArray, rivals: Sequence[Rival]) -> FloatArray:
     """
     total = np.zeros((len(held), 3, 3))
     for rival in rivals:
-        c, s = np.cos(held[:, 2]), np.sin(held[:, 2])
-        dx, dy, turn = (rival.poses - held).T
-        apart = np.column_stack([c * dx + s * dy, c * dy - s * dx, se2.wrap_array(turn)])
+        apart = se2.between_array(held, rival.poses)
         total += apart[:, :, None] * apart[:, None, :]
     return total / max(len(rivals), 1)
 

@@ -24,12 +24,13 @@ from fgloc.graph.factors import (
     linear_factor,
     motion_factor,
     pose_key,
+    pose_vector,
     prior_factor,
     sighting_factors,
 )
 from fgloc.graph.ground import ground_factors, ground_prior, is_level_known, levelled, predict, starting, step_of
 from fgloc.graph.installation import GROUND, VACANT_SIGMA, Installation, InstallationEstimate, installation_of
-from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov, split
+from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov
 from fgloc.graph.measurement_log import Keyframe, LoggedSighting, MeasurementLog, PoseWithCovariance, Remounting
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.learned.sensor import gains_of
@@ -206,13 +207,10 @@ class Estimator(ABC):
         """
         rows, added = self.installation.mounting(kind)
         known = belief.installation or self.installed
-        mean, cov = known.mean.copy(), known.cov.copy()
-        cross: FloatArray = np.zeros((3, len(cov))) if belief.cross is None else belief.cross.copy()
-        cov[rows], cov[:, rows], cross[:, rows] = 0.0, 0.0, 0.0
-        cov[rows, rows] = added
-        if now is not None:
-            mean[rows], cov[np.ix_(rows, rows)] = now.mean[rows], now.cov[np.ix_(rows, rows)]
-        return PoseWithCovariance(belief.pose, belief.cov, cross, InstallationEstimate(mean, cov))
+        cross: FloatArray = np.zeros((3, len(known.cov))) if belief.cross is None else belief.cross.copy()
+        cross[:, rows] = 0.0
+        anew = (np.diag(added), None) if now is None else (now.cov[np.ix_(rows, rows)], now.mean[rows])
+        return PoseWithCovariance(belief.pose, belief.cov, cross, known.anew(rows, *anew))
 
     def remount(
         self, belief: PoseWithCovariance, kind: str, since_ns: int, now: InstallationEstimate | None = None
@@ -294,14 +292,12 @@ class Estimator(ABC):
     def _forgetful(self, belief: PoseWithCovariance, rows: Sequence[slice]) -> PoseWithCovariance:
         """The belief with nothing but their prior known of these rows of the installation."""
         known, prior = belief.installation or self.installed, self.installation.prior()
-        mean, cov = known.mean.copy(), known.cov.copy()
         cross = None if belief.cross is None else belief.cross.copy()
         for own in rows:
-            mean[own], cov[own], cov[:, own] = prior.mean[own], 0.0, 0.0
-            cov[own, own] = prior.cov[own, own]
+            known = known.anew(np.arange(own.start, own.stop), prior.cov[own, own], prior.mean[own])
             if cross is not None:
                 cross[:, own] = 0.0
-        return PoseWithCovariance(belief.pose, belief.cov, cross, InstallationEstimate(mean, cov))
+        return PoseWithCovariance(belief.pose, belief.cov, cross, known)
 
     @abstractmethod
     def _add_prior(self, rows: Sequence[slice]) -> None:
@@ -326,12 +322,11 @@ class Estimator(ABC):
 
     def asked(self) -> InstallationEstimate:
         """Installation in which held constants have the value at which they left the gate of their prior."""
-        mean, cov = self.installed.mean.copy(), self.installed.cov.copy()
+        known = self.installed
         for name, (value, sigma) in self.contradicted.items():
-            i = self.installation.index[name]
-            cov[i], cov[:, i] = 0.0, 0.0
-            mean[i], cov[i, i] = value, sigma**2
-        return InstallationEstimate(mean, cov)
+            row = np.array([self.installation.index[name]])
+            known = known.anew(row, np.array([[sigma**2]]), np.array([value]))
+        return known
 
     def _held(self) -> list[int]:
         """Rows of pose and installation together that are held."""
@@ -372,10 +367,8 @@ class Estimator(ABC):
         rows, prior = self._held(), self.installation.prior()
         held = [i - 3 for i in rows]
         P = considered(joint_cov(belief, belief.installation), rows, prior.cov[np.ix_(held, held)])
-        found = split(belief, P)
-        assert found.installation is not None
-        found.installation.mean[held] = prior.mean[held]
-        return found
+        belief.installation.mean[held] = prior.mean[held]
+        return PoseWithCovariance.jointly(belief.pose, belief.installation.mean, P)
 
     def _adopt(self, belief: PoseWithCovariance) -> None:
         self.belief = belief
@@ -453,9 +446,8 @@ class ExtendedKalmanFilter(Estimator):
         rows, P, prior = self._held(), joint_cov(belief, known), self.installation.prior()
         gap = np.array([prior.mean[i - 3] - known.mean[i - 3] for i in rows])
         shift = np.linalg.solve(P[np.ix_(rows, rows)], P[rows]).T @ gap
-        moved = InstallationEstimate(known.mean + shift[3:], known.cov)
         pose = se2.compose(belief.pose, se2.exp(shift[:3]))
-        return split(PoseWithCovariance(pose, belief.cov, belief.cross, moved), conditioned(P, rows))
+        return PoseWithCovariance.jointly(pose, known.mean + shift[3:], conditioned(P, rows))
 
     def _begin_at(self, newest: Keyframe) -> None:
         """Do nothing: a filter holds no earlier keyframes."""
@@ -555,19 +547,15 @@ def _joint(isam2: gtsam.ISAM2, pose: FloatArray, k: int) -> PoseWithCovariance:
     if failed:
         raise RuntimeError("the joint information of pose and installation is singular")
     upper = np.triu(upper)
-    P = upper + np.triu(upper, 1).T
-    return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], InstallationEstimate(np.asarray(theta), P[3:, 3:]))
+    return PoseWithCovariance.jointly(pose, np.asarray(theta), upper + np.triu(upper, 1).T)
 
 
 def _joint_on_ground(isam2: gtsam.ISAM2, pose: FloatArray, k: int, n: int) -> PoseWithCovariance:
     """Joint belief as `_joint`; the installation ends with height, roll and pitch of the ground at the keyframe."""
     keys = [pose_key(k), *([INSTALLATION] if n > len(GROUND) else []), ground_key(k)]
     found = isam2.jointMarginalCovariance(keys)
-    P = np.block([[np.asarray(found.at(a, b)) for b in keys] for a in keys])
-    known = InstallationEstimate(
-        np.concatenate([np.asarray(isam2.calculateEstimateVector(key)) for key in keys[1:]]), P[3:, 3:]
-    )
-    return PoseWithCovariance(pose, P[:3, :3], P[:3, 3:], known)
+    mean = np.concatenate([np.asarray(isam2.calculateEstimateVector(key)) for key in keys[1:]])
+    return PoseWithCovariance.jointly(pose, mean, np.block([[np.asarray(found.at(a, b)) for b in keys] for a in keys]))
 
 
 def isam2_params(config: EstimatorConfig, installed: int = 0, careful: bool = False) -> gtsam.ISAM2Params:
@@ -592,11 +580,6 @@ def isam2_params(config: EstimatorConfig, installed: int = 0, careful: bool = Fa
     params.relinearizeSkip = 1
     params.findUnusedFactorSlots = True
     return params
-
-
-def pose_vector(pose: gtsam.Pose2) -> FloatArray:
-    """A pose as ``(3,)``."""
-    return np.array([pose.x(), pose.y(), pose.theta()])
 
 
 # --- The incremental estimator ----------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from operator import is_not
 from typing import Any
@@ -41,11 +41,6 @@ INSTALLATION = int(gtsam.symbol("i", 0))
 def ground_key(k: int) -> int:
     """Key of height, roll and pitch of keyframe k: one vector."""
     return int(gtsam.symbol("g", k))
-
-
-def of_ground(pose: int) -> int:
-    """Key of height, roll and pitch of the keyframe whose pose has this key."""
-    return ground_key(gtsam.Symbol(pose).index())
 
 
 def insert_installation(k: int, theta: FloatArray, constants: int, values: gtsam.Values) -> None:
@@ -86,6 +81,11 @@ _MOST_LOOKALIKES = 10
 def pose_key(k: int) -> int:
     """Key of the pose of keyframe k."""
     return int(gtsam.symbol("x", k))
+
+
+def pose_vector(pose: gtsam.Pose2) -> FloatArray:
+    """A pose as ``(3,)``."""
+    return np.array([pose.x(), pose.y(), pose.theta()])
 
 
 def landmark_key(landmark_id: int) -> int:
@@ -188,23 +188,18 @@ def prior_factor(k: int, pose: FloatArray, cov: FloatArray) -> gtsam.NonlinearFa
     return gtsam.PriorFactorPose2(pose_key(k), gtsam.Pose2(*pose), gaussian(cov))
 
 
-def point_factor(k: int, m: PointMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
-    """Sighting of a landmark that is a variable, a point."""
-    bearing, noise = gtsam.Rot2(m.bearing_rad), robust(gaussian(m.cov), cauchy_k)
-    return gtsam.BearingRangeFactor2D(pose_key(k), landmark_key(m.landmark_id), bearing, m.range_m, noise)
+def variable_factor(k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
+    """Sighting of a landmark that is a variable, a point or a pose.
 
-
-def frame_factor(k: int, m: FrameMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
-    """Sighting of a landmark that is a variable, a pose."""
-    noise = robust(gaussian(m.cov), cauchy_k)
-    return gtsam.BetweenFactorPose2(pose_key(k), landmark_key(m.landmark_id), gtsam.Pose2(*m.pose), noise)
-
-
-_OF_VARIABLE: Mapping[int, Callable[[int, Any, float | None], gtsam.NonlinearFactor]] = {
-    2: point_factor,
-    3: frame_factor,
-}
-"""Factor of a sighting by `LandmarkMeasurement.variable_dof`."""
+    Raises:
+        EstimatorError: it never is one.
+    """
+    if not isinstance(m, PointMeasurement | FrameMeasurement):
+        raise EstimatorError("marker corners need a known map: give --map, or build one with `fgloc map`")
+    keys, noise = (pose_key(k), landmark_key(m.landmark_id)), robust(gaussian(m.cov), cauchy_k)
+    if isinstance(m, PointMeasurement):
+        return gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(m.bearing_rad), m.range_m, noise)
+    return gtsam.BetweenFactorPose2(*keys, gtsam.Pose2(*m.pose), noise)
 
 
 _NOTHING: tuple[FloatArray, dict[int, tuple[LandmarkMeasurement, int]], Lines] = np.zeros(3), {}, Lines.of((), 0)
@@ -312,7 +307,7 @@ class LandmarkFactors:
             CovarianceError: the measurement's covariance is not one.
         """
         if self._known is None:
-            return LoggedSighting(m, alone or m, cauchy_k, self._unknown(k, m, cauchy_k))
+            return LoggedSighting(m, alone or m, cauchy_k, variable_factor(k, m, cauchy_k))
         if m.of_landmark and m.landmark_id not in self._known:
             raise EstimatorError(f"landmark {m.landmark_id} is not in the map ({len(self._known)} landmarks)")
         if m.cov is not None and (problem := covariance_problem(m.cov)):
@@ -375,8 +370,3 @@ class LandmarkFactors:
             return level
         z, *angles = self._estimated.mean[self.installation.constants :].tolist()
         return np.asarray((level - [0.0, 0.0, z]) @ rotations(np.array([angles]))[0])
-
-    def _unknown(self, k: int, m: LandmarkMeasurement, cauchy_k: float | None) -> gtsam.NonlinearFactor:
-        if m.variable_dof not in _OF_VARIABLE:
-            raise EstimatorError("marker corners need a known map: give --map, or build one with `fgloc map`")
-        return _OF_VARIABLE[m.variable_dof](k, m, cauchy_k)

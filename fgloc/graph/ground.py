@@ -17,7 +17,7 @@ from fgloc import se2
 from fgloc.frames import rotations
 from fgloc.graph.factors import INSTALLATION, ground_key, linear_factor
 from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
-from fgloc.graph.joint import LINEAR_RAD, fuse_installed, joint_cov, predict_on_plane
+from fgloc.graph.joint import LINEAR_RAD, as_installed, fuse_installed, joint_cov, predict_on_plane
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import whitening_of
 from fgloc.sensors.gyro import BIASES, LEVELS, TILTS
@@ -124,12 +124,7 @@ def ground_step(
         installation: its parameters.
     """
     motion, motion_cov, depends = fused
-    by_theta = np.zeros((3, installation.constants))
-    for name, (derivative, assumed) in depends.items():
-        if name in installation.index:
-            i = installation.index[name]
-            by_theta[:, i] = derivative
-            motion = se2.compose(motion, se2.exp(derivative * (theta[i] - assumed)))
+    motion, by_theta = as_installed(motion, depends, installation, theta, installation.constants)
     inertial = motions[0].inertial
     measured, by_bias = _turn_of(inertial, float(motion[2]), theta, installation)
     smooth = _smooth(motion, measured)
@@ -171,7 +166,8 @@ def _smooth(motion: FloatArray, turn: FloatArray) -> float:
 def _projected(m: MotionMeasurement, planar: FloatArray, P: FloatArray) -> MotionMeasurement:
     """A motion in the plane of the map; ``P (3, 3)``: its derivative by that in the robot's plane."""
     depends = {name: (P @ derivative, at) for name, (derivative, at) in m.depends_on.items()}
-    return replace(m, motion=planar, cov=_symmetric(P @ m.cov @ P.T), depends_on=depends)
+    cov = P @ m.cov @ P.T
+    return replace(m, motion=planar, cov=0.5 * (cov + cov.T), depends_on=depends)
 
 
 def _perturbed(
@@ -229,10 +225,6 @@ def _added(inertial: InertialReading | None, motion: FloatArray, A: FloatArray, 
         added[1, 1] = added[2, 2] = _TILT_PER_SQRT_M**2 * way + _TILT_PER_SQRT_RAD**2 * turned + 1e-10
         added[0, 0] += (0.5 * way) ** 2 * _TILT_PER_SQRT_M**2 * way
     return added
-
-
-def _symmetric(cov: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (cov + cov.T))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -334,8 +326,7 @@ def _corrected(belief: PoseWithCovariance, residual: FloatArray, H: FloatArray, 
     moved = -gain @ residual
     P = P - gain @ H @ P
     P = 0.5 * (P + P.T)
-    theta = InstallationEstimate(known.mean + moved[3:], P[3:, 3:])
-    return PoseWithCovariance(belief.pose, P[:3, :3], P[:3, 3:], theta)  # the pose itself hardly depends on it
+    return PoseWithCovariance.jointly(belief.pose, known.mean + moved[3:], P)  # the pose itself hardly depends on it
 
 
 def step_of(motions: Sequence[MotionMeasurement], theta: FloatArray, installation: Installation) -> GroundStep:
@@ -397,11 +388,8 @@ def starting(known: InstallationEstimate, installation: Installation) -> Install
     if not installation.ground:
         return known
     prior, c = installation.prior(), installation.constants
-    mean, cov = known.mean.copy(), known.cov.copy()
-    mean[c] = prior.mean[c]
-    cov[c:, :], cov[:, c:] = 0.0, 0.0
-    cov[c:, c:] = prior.cov[c:, c:]
-    return InstallationEstimate(mean, cov)
+    mean = np.append(prior.mean[c], known.mean[c + 1 :])
+    return known.anew(np.arange(c, len(known.mean)), prior.cov[c:, c:], mean)
 
 
 def levelled(

@@ -10,8 +10,9 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -63,6 +64,15 @@ class InstallationEstimate:
 
     mean: FloatArray
     cov: FloatArray
+
+    def anew(self, rows: IntArray, cov: FloatArray, mean: FloatArray | None = None) -> Self:
+        """Copy with nothing but this known of rows ``(k,)``: a covariance ``(k, k)`` and, if given, a mean ``(k,)``."""
+        means, covs = self.mean.copy(), self.cov.copy()
+        covs[rows], covs[:, rows] = 0.0, 0.0
+        covs[np.ix_(rows, rows)] = cov
+        if mean is not None:
+            means[rows] = mean
+        return replace(self, mean=means, cov=covs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

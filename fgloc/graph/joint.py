@@ -7,7 +7,7 @@ Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method".
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,11 +66,33 @@ def fuse_installed(
 def transition(motions: Sequence[MotionMeasurement], installation: Installation) -> tuple[FloatArray, FloatArray]:
     """Derivatives ``(3, 3)`` and ``(3, n)`` of the pose after these motions by the pose before and the installation."""
     motion, _, depends = fuse_installed(motions)
-    D = np.zeros((3, len(installation)))
-    for name, (derivative, _) in depends.items():
+    return se2.adjoint(se2.inverse(motion)), as_installed(motion, depends, installation)[1]
+
+
+def as_installed(
+    motion: FloatArray,
+    depends: Mapping[str, tuple[FloatArray, float]],
+    installation: Installation,
+    theta: FloatArray | None = None,
+    width: int | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """A motion ``(3,)`` with another installation, and its derivative ``(3, width)`` by the installation.
+
+    Args:
+        motion: with the installation that was assumed.
+        depends: its derivatives, and what was assumed.
+        installation: parameters.
+        theta: ``(n,)`` the installation; None: as assumed.
+        width: the first parameters of it by which the derivative is wanted; None: all.
+    """
+    D = np.zeros((3, len(installation) if width is None else width))
+    for name, (derivative, assumed) in depends.items():
         if name in installation.index:
-            D[:, installation.index[name]] = derivative
-    return se2.adjoint(se2.inverse(motion)), D
+            i = installation.index[name]
+            D[:, i] = derivative
+            if theta is not None:
+                motion = se2.compose(motion, se2.exp(derivative * (theta[i] - assumed)))
+    return motion, D
 
 
 def predict_on_plane(
@@ -81,12 +103,7 @@ def predict_on_plane(
 ) -> PoseWithCovariance:
     """Pose and installation after the motions of one step."""
     motion, cov, depends = fuse_installed(motions)
-    D = np.zeros((3, len(installation)))
-    for name, (derivative, assumed) in depends.items():
-        if name in installation.index:
-            i = installation.index[name]
-            D[:, i] = derivative
-            motion = se2.compose(motion, se2.exp(derivative * (known.mean[i] - assumed)))
+    motion, D = as_installed(motion, depends, installation, known.mean)
     A = se2.adjoint(se2.inverse(motion))
     cross = np.zeros_like(D) if belief.cross is None else belief.cross
     across = A @ cross
@@ -177,11 +194,7 @@ def correct(
         return None
     gain = P @ found.H.T
     after_cov = P - gain @ cho_solve(factor, gain.T, check_finite=False)
-    after_cov = 0.5 * (after_cov + after_cov.T)
-    corrected = PoseWithCovariance(
-        pose, after_cov[:3, :3], after_cov[:3, 3:], InstallationEstimate(theta, after_cov[3:, 3:])
-    )
-    return corrected, cost
+    return PoseWithCovariance.jointly(pose, theta, 0.5 * (after_cov + after_cov.T)), cost
 
 
 def conditioned(P: FloatArray, rows: Sequence[int]) -> FloatArray:
@@ -205,13 +218,6 @@ def considered(P: FloatArray, rows: Sequence[int], prior: FloatArray) -> FloatAr
     gain = np.linalg.solve(held, P[rows]).T
     spread = P + gain @ (prior - held) @ gain.T
     return np.asarray(0.5 * (spread + spread.T))
-
-
-def split(belief: PoseWithCovariance, P: FloatArray) -> PoseWithCovariance:
-    """The belief with another joint covariance ``(3 + n, 3 + n)`` of pose and installation."""
-    assert belief.installation is not None
-    known = InstallationEstimate(belief.installation.mean, P[3:, 3:])
-    return PoseWithCovariance(belief.pose, P[:3, :3], P[:3, 3:], known)
 
 
 def is_linear(belief: PoseWithCovariance) -> bool:

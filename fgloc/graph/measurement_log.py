@@ -26,6 +26,11 @@ class PoseWithCovariance:
     cross: FloatArray | None = None
     installation: InstallationEstimate | None = None
 
+    @classmethod
+    def jointly(cls, pose: FloatArray, mean: FloatArray, P: FloatArray) -> PoseWithCovariance:
+        """A pose with an installation of this mean ``(n,)``, and the covariance ``(3 + n, 3 + n)`` of both."""
+        return cls(pose, P[:3, :3], P[:3, 3:], InstallationEstimate(mean, P[3:, 3:]))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedSighting:

@@ -11,8 +11,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -126,6 +125,9 @@ def byte_array(values: Any) -> NDArray[np.uint8]:
 # --- the first settings of a robot ------------------------------------------------------------------------------------
 
 
+E = TypeVar("E", bound=Event)
+
+
 @dataclass(frozen=True, slots=True)
 class FirstLook:
     """Content of a recording of an unknown robot, from which a sensor's first settings are made.
@@ -143,6 +145,15 @@ class FirstLook:
     recording: Any
     has_map: bool
     landmark_map: LandmarkMap | None = None
+
+    def of(self, kind: type[E]) -> list[E]:
+        """Events of a class that the sensor asked for."""
+        return [event for event in self.events[kind] if isinstance(event, kind)]
+
+    @property
+    def kinds(self) -> set[str]:
+        """Roles, without the names of cameras."""
+        return {role.rpartition("/")[2] for role in self.roles}
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,15 +259,7 @@ class Stream(NamedTuple):
         if self.validator is not None:
             return self.validator(checks)
         check = self.check
-        return _unchecked if check is None else partial(_checked, check, checks.config)
-
-
-def _unchecked(event: Event) -> Event | str:
-    return event
-
-
-def _checked(check: Check, config: GateConfig, event: Any) -> Event | str:
-    return check(event, config)
+        return (lambda event: event) if check is None else (lambda event: check(event, checks.config))
 
 
 class RawMistake(NamedTuple):

@@ -32,19 +32,9 @@ def from_twist(message: Any, when: When) -> Event:
     return ControlEvent(*when, float(message.linear.x), float(message.angular.z), float(message.linear.y))
 
 
-def from_twist_stamped(message: Any, when: When) -> Event:
-    """Event of a ``geometry_msgs/TwistStamped``."""
-    return from_twist(message.twist, when)
-
-
 def from_ackermann(message: Any, when: When) -> Event:
     """Event of an ``ackermann_msgs/AckermannDrive``: its yaw rate follows from `wheels.drive`."""
     return ControlEvent(*when, float(message.speed), 0.0, steering=float(message.steering_angle))
-
-
-def from_ackermann_stamped(message: Any, when: When) -> Event:
-    """Event of an ``ackermann_msgs/AckermannDriveStamped``."""
-    return from_ackermann(message.drive, when)
 
 
 def told(event: ControlEvent, drive: Drive | None) -> ControlEvent:
@@ -106,9 +96,9 @@ COMMANDS = BuiltIn(
             ControlEvent,
             {
                 "geometry_msgs/msg/Twist": from_twist,
-                "geometry_msgs/msg/TwistStamped": from_twist_stamped,
+                "geometry_msgs/msg/TwistStamped": lambda m, when: from_twist(m.twist, when),
                 "ackermann_msgs/msg/AckermannDrive": from_ackermann,
-                "ackermann_msgs/msg/AckermannDriveStamped": from_ackermann_stamped,
+                "ackermann_msgs/msg/AckermannDriveStamped": lambda m, when: from_ackermann(m.drive, when),
             },
             ("cmd_vel", "ackermann_cmd", "drive"),
             validator=validator,

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -152,15 +152,24 @@ class Failure(Section):
 
 
 class EventFailure(Failure):
-    """A failure that changes or drops events one by one and leaves their order alone."""
+    """A failure that changes or drops events one by one and leaves their order alone.
 
-    @abstractmethod
+    A subclass gives `change` or, if it has a state of one run, `begin`; and `changes`, or `targets` by its settings.
+    """
+
+    changes: ClassVar[tuple[type[Event], ...]] = ()  # classes of events
+
     def targets(self) -> tuple[type[Event], ...]:
         """Classes of the events that the failure changes."""
+        return self.changes
 
-    @abstractmethod
     def begin(self, scene: Scene) -> Change:
         """Return the function that changes one event (None: drops it), with the state of one run."""
+        return lambda event: self.change(event, scene)
+
+    def change(self, event: Any, scene: Scene) -> Event | None:
+        """The event, changed; None: it is dropped."""
+        raise NotImplementedError
 
     def apply(self, events: Iterator[Event], scene: Scene) -> Iterator[Event]:
         """The corrupted events, in order of receive time."""

@@ -26,7 +26,7 @@ from pydantic import Field
 
 from fgloc.config import Config, GateConfig, Section
 from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, Stream, When
-from fgloc.sensors.failures import Change, EventFailure, Scene
+from fgloc.sensors.failures import EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, SensorEvent
 
@@ -152,26 +152,18 @@ class GnssPosition(PoseMeasurement):
 class Multipath(EventFailure):
     """Reflections move positions, each by a draw of its own: in any direction, exponentially far."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (GnssEvent,)
     sizes: ClassVar[tuple[str, ...]] = ("mean_m",)
     kind: Literal["gnss_multipath"] = "gnss_multipath"
     mean_m: float = Field(3.0, gt=0, description="mean distance, exponentially distributed [m]")
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Positions."""
-        return (GnssEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Move one."""
-
-        def move(event: Event) -> Event:
-            assert isinstance(event, GnssEvent)
-            distance, direction = scene.rng.exponential(self.mean_m), scene.rng.uniform(-math.pi, math.pi)
-            north = math.degrees(distance * math.sin(direction) / _SEMI_MAJOR_M)
-            meridian = _SEMI_MAJOR_M * math.cos(math.radians(event.latitude))
-            east = math.degrees(distance * math.cos(direction) / max(meridian, 1.0))
-            return replace(event, latitude=event.latitude + north, longitude=event.longitude + east)
-
-        return move
+    def change(self, event: GnssEvent, scene: Scene) -> Event:
+        """Move one position."""
+        distance, direction = scene.rng.exponential(self.mean_m), scene.rng.uniform(-math.pi, math.pi)
+        north = math.degrees(distance * math.sin(direction) / _SEMI_MAJOR_M)
+        meridian = _SEMI_MAJOR_M * math.cos(math.radians(event.latitude))
+        east = math.degrees(distance * math.cos(direction) / max(meridian, 1.0))
+        return replace(event, latitude=event.latitude + north, longitude=event.longitude + east)
 
 
 # --- First settings ---------------------------------------------------------------------------------------------------
@@ -188,7 +180,7 @@ def _origin(fixes: Sequence[GnssEvent]) -> str:
 
 def _first_section(look: FirstLook) -> FirstSection:
     """A proposal for the origin, for the user to take: how far positions may be trusted is not told by a recording."""
-    passed = (check(event, GateConfig()) for event in look.events[GnssEvent] if isinstance(event, GnssEvent))
+    passed = (check(event, GateConfig()) for event in look.of(GnssEvent))
     fixes = [event for event in passed if isinstance(event, GnssEvent)]
     if not fixes:
         return FirstSection()

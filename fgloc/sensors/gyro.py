@@ -35,7 +35,7 @@ from fgloc.sensors.base import (
     xyz,
 )
 from fgloc.sensors.checks import Changes, FieldChecks, Table, count, finite_rows, spikes
-from fgloc.sensors.failures import Carriage, Change, EventFailure, Scene
+from fgloc.sensors.failures import Carriage, EventFailure, Scene
 from fgloc.sensors.wheels.motion import Standing
 from fgloc.stats import GATE, chi2_bound
 from fgloc.types import Event, FloatArray, Grave, InertialEvent, InertialReading, Setting, Step
@@ -165,24 +165,14 @@ def _parameters(config: Config, sources: Collection[str]) -> tuple[Parameter, ..
     return (scale, *biases, *tilts, *(Parameter(name, config.gyro.level_sigma_rad) for name in LEVELS))
 
 
-def _found_rows(config: Config) -> tuple[FoundRow, ...]:
-    """Rows of ``metrics.json`` on the gyro."""
-    return (FoundRow("gyro.scale", "gyro.scale", 1.0, -1.0),)
-
-
 def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
     """Settings of the gyro, as a run has estimated them."""
     scale = config.gyro.scale
     yield from state.setting("gyro.scale", scale, scale * (1.0 + state.value("gyro.scale")), {"gyro.scale": scale})
 
 
-def _derivatives(motion: FloatArray) -> dict[str, FloatArray]:
-    """Derivative ``(3,)`` of a motion whose turn is the gyro's (right perturbation) by each parameter."""
-    rho_x, rho_y, phi = se2.log(motion)
-    return {"gyro.scale": phi * np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])}
-
-
-INSTALLATION = MotionInstallation(_parameters, _found_rows, _settings, {"gyro.scale": "gyro.scale_sigma"})
+_FOUND = (FoundRow("gyro.scale", "gyro.scale", 1.0, -1.0),)
+INSTALLATION = MotionInstallation(_parameters, lambda config: _FOUND, _settings, {"gyro.scale": "gyro.scale_sigma"})
 
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
@@ -276,8 +266,9 @@ class Gyro:
         return np.asarray(np.interp(at, times, rates) - self.bias)
 
     def derivatives(self, motion: FloatArray) -> dict[str, FloatArray]:
-        """Derivatives ``(3,)`` of a motion whose turn is this gyro's, by parameter of the gyro."""
-        return _derivatives(motion)
+        """Derivatives ``(3,)`` of a motion whose turn is this gyro's (right perturbation), by parameter of the gyro."""
+        rho_x, rho_y, phi = se2.log(motion)
+        return {"gyro.scale": phi * np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])}
 
     def turned(self, yaw: float, seconds: float) -> None:
         """Add the turn [rad] of a step, as `measure` gave it, to the turn since the last fix."""
@@ -324,15 +315,17 @@ class Gyro:
         """Turn [rad] of the rates as they are, joined by straight lines and held at the ends."""
         if not events:
             return None
-        up = self._up
         times = np.array([(event.stamp_ns - start_ns) * 1e-9 for event in events])
-        rates = np.array([event.angular_velocity for event in events]) @ up
-        end = (end_ns - start_ns) * 1e-9
-        inside = times[(times > 0.0) & (times < end)]
-        nodes = np.concatenate([[0.0], inside, [end]])
-        if max(times[0], end - times[-1]) > _MAX_GAP_S or (len(times) > 1 and np.diff(times).max() > _MAX_GAP_S):
-            return None
-        return float(np.trapezoid(np.interp(nodes, times, rates), nodes))
+        rates = np.array([event.angular_velocity for event in events]) @ self._up
+        nodes = _nodes(times, (end_ns - start_ns) * 1e-9)
+        return None if nodes is None else float(np.trapezoid(np.interp(nodes, times, rates), nodes))
+
+
+def _nodes(times: FloatArray, end: float) -> FloatArray | None:
+    """Times ``(m,)`` [s] from 0 to an end, with those of the samples between; None where these were silent for long."""
+    if max(times[0], end - times[-1]) > _MAX_GAP_S or (len(times) > 1 and np.diff(times).max() > _MAX_GAP_S):
+        return None
+    return np.concatenate([[0.0], times[(times > 0.0) & (times < end)], [end]])
 
 
 _SPEED_SIGMA = 0.015  # m/s: by what wheels and a mean over 40 ms are off from the robot's speed at one time
@@ -369,12 +362,11 @@ class Attitude:
         if dt <= 0.0 or not step.inertial:
             return None
         times, rates, forces = self._samples(step.inertial, step.start_ns)
-        inside = times[(times > 0.0) & (times < dt)]
-        nodes = np.concatenate([[0.0], inside, [dt]])
-        if max(times[0], dt - times[-1]) > _MAX_GAP_S or (len(times) > 1 and np.diff(times).max() > _MAX_GAP_S):
+        nodes = _nodes(times, dt)
+        if nodes is None:
             return None
         at = np.column_stack([np.interp(nodes, times, rates[:, i]) for i in range(3)])
-        turn = np.trapezoid(at, nodes, axis=0)
+        turn = np.asarray(np.trapezoid(at, nodes, axis=0))
         sampled = (times > 0.0) & (times <= dt)
         force, variance = None, self._config.acceleration_sigma**2 + 2.0 * (_SPEED_SIGMA / dt) ** 2
         if sampled.any() and np.isfinite(forces[sampled]).all() and forces[sampled].any():
@@ -434,28 +426,19 @@ CHANNELS = (
 class ImuBias(EventFailure):
     """The gyroscope's yaw rate is off by ``yaw_rate`` and the accelerometer by ``acceleration``."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (ImuEvent,)
     sizes: ClassVar[tuple[str, ...]] = ("yaw_rate", "acceleration")
     kind: Literal["imu_bias"] = "imu_bias"
     yaw_rate: float = Field(0.05, description="rad/s, about z")
     acceleration: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="m/s², in the sensor's axes")
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Classes of the changed events: IMU messages."""
-        return (ImuEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Return the function that adds the biases to a message."""
-        rates, accelerations = np.array([0.0, 0.0, self.yaw_rate]), np.array(self.acceleration)
-
-        def bias(event: Event) -> Event:
-            assert isinstance(event, ImuEvent)
-            return replace(
-                event,
-                angular_velocity=event.angular_velocity + rates,
-                linear_acceleration=event.linear_acceleration + accelerations,
-            )
-
-        return bias
+    def change(self, event: ImuEvent, scene: Scene) -> Event:
+        """Add the biases to a message."""
+        return replace(
+            event,
+            angular_velocity=event.angular_velocity + np.array([0.0, 0.0, self.yaw_rate]),
+            linear_acceleration=event.linear_acceleration + np.array(self.acceleration),
+        )
 
 
 _BOUNCE_HZ, _BOUNCE_M_S2 = 1.9, 1.0  # vertical acceleration of what a walking person carries: amplitude

@@ -182,7 +182,15 @@ class _Builder:
 
     def size(self, item: Item) -> float:
         """Side of a marker [m] that the file gives."""
-        return _size(item, self.size_scale)
+        size = self.size_scale * item.number()
+        if size <= 0.0:
+            raise item.fail(f"marker size {size:g} m, expected more than 0")
+        if size > _MAX_SIZE_M:
+            unit, metres = ("cm", size / 100.0) if size < 100.0 else ("mm", size / 1000.0)
+            raise item.fail(
+                f"marker size {size:g} m is too large; sizes are in metres: if it is {size:g} {unit}, write {metres:g}"
+            )
+        return size
 
     def finish(self, path: Path, root: Item, dictionary: str, notes: list[str]) -> LandmarkMap:
         """The checked map."""
@@ -502,15 +510,3 @@ def _unit(item: Item, quaternion: FloatArray) -> FloatArray:
 
 def _xyz(item: Item) -> FloatArray:
     return np.array([item.need(key).number() for key in ("x", "y", "z")])
-
-
-def _size(item: Item, scale: float) -> float:
-    size = scale * item.number()
-    if size <= 0.0:
-        raise item.fail(f"marker size {size:g} m, expected more than 0")
-    if size > _MAX_SIZE_M:
-        unit, metres = ("cm", size / 100.0) if size < 100.0 else ("mm", size / 1000.0)
-        raise item.fail(
-            f"marker size {size:g} m is too large; sizes are in metres: if it is {size:g} {unit}, write {metres:g}"
-        )
-    return size

@@ -1,6 +1,6 @@
 """Measurements of where the robot is: one interface for those of built-in sensors and of other packages.
 
-`LandmarkMeasurement` is what gate, association, landmark modes, search, estimators and batch know of a measurement.
+`Measured` is what gate, association, landmark modes, search, estimators and batch know of a `LandmarkMeasurement`.
 Sightings of the map's landmarks are of three kinds: corners in an image, range and bearing, pose of a marker. A sensor
 of another package yields these too, or a `PoseMeasurement`: any function of the robot's pose. Everything here is numpy;
 factors are made in `fgloc.graph`.
@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -30,7 +30,7 @@ _AT_REST = np.zeros(3)
 _LEVEL = np.zeros(2)
 
 
-# --- The interface ----------------------------------------------------------------------------------------------------
+# --- What all measurements have in common -----------------------------------------------------------------------------
 
 
 class Model(Enum):
@@ -41,113 +41,46 @@ class Model(Enum):
     POSE = "pose"  # `PoseMeasurement.residual_at`, one by one
 
 
-class LandmarkMeasurement(Protocol):
-    """Measurement of where the robot is: of a landmark of the map, or of a place that its sensor knows."""
+class Measured:
+    """Measurement of where the robot is: of a landmark of the map, or of a place that its sensor knows.
 
-    @property
-    def model(self) -> Model:
-        """Model by which residual and Jacobians are computed."""
-        ...
+    Attributes:
+        model: by which residual and Jacobians are computed.
+        stamp_ns: time of the measurement [ns].
+        landmark_id: of the map; a negative number of the sensor's own if it is of none.
+        cov: covariance ``(d, d)`` of the residual; None: corners, all with the noise of the image.
+        cauchy_k: Cauchy constant of the search for the first pose and of unknown landmarks, in units of sigma.
+        row_kind: kind of its row in ``steps.csv``.
+        row_id: landmark of its row in ``steps.csv``; -1: none.
+        counted_as: name under which the measurement is counted if it is rejected.
+        of_landmark: whether it is of a landmark of the map; else of a place that only its sensor knows.
+        unnamed: whether it is of a landmark of the map without saying of which; see `fgloc.estimation.unnamed`.
+        is_point: whether it is range and bearing of a point (`PointMeasurement`): explained by the poses on a ring.
+        gives_pose: whether it gives the pose of the base by itself, if the landmark is known.
+        in_pixels: whether its noise is that of an image.
+        errors_repeat: whether the next sighting of the landmark has much the same error.
+        observes_yaw: whether it determines the yaw by itself.
+        variable_dof: numbers of its landmark as a variable, where no map is known: 2 of a point, 3 of a pose; 0: never
+            one.
+        bias_key: measurements of one key are tested for a common bias; None: there is no such test.
+        dof: length of the residual.
+        information: weight in comparison with others of its kind.
+    """
 
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the measurement [ns]."""
-        ...
+    __slots__ = ()
 
-    @property
-    def landmark_id(self) -> int:
-        """Landmark of the map; a negative number of the sensor's own if it is of none."""
-        ...
-
-    @property
-    def cov(self) -> FloatArray | None:
-        """Covariance ``(d, d)`` of the residual; None: corners, all with the noise of the image."""
-        ...
-
-    @property
-    def cauchy_k(self) -> float:
-        """Cauchy constant of the search for the first pose and of unknown landmarks, in units of sigma."""
-        ...
-
-    @property
-    def row_kind(self) -> str:
-        """Kind of its row in ``steps.csv``."""
-        ...
-
-    @property
-    def row_id(self) -> int:
-        """Landmark of its row in ``steps.csv``; -1: none."""
-        ...
-
-    @property
-    def counted_as(self) -> str:
-        """Name under which the measurement is counted if it is rejected."""
-        ...
-
-    @property
-    def of_landmark(self) -> bool:
-        """Whether it is of a landmark of the map; else of a place that only its sensor knows."""
-        ...
-
-    @property
-    def unnamed(self) -> bool:
-        """Whether it is of a landmark of the map without saying of which; see `fgloc.estimation.unnamed`."""
-        ...
-
-    @property
-    def is_point(self) -> bool:
-        """Whether it is range and bearing of a point (`PointMeasurement`): explained by the poses on a ring."""
-        ...
-
-    @property
-    def gives_pose(self) -> bool:
-        """Whether it gives the pose of the base by itself, if the landmark is known."""
-        ...
-
-    @property
-    def in_pixels(self) -> bool:
-        """Whether its noise is that of an image."""
-        ...
-
-    @property
-    def errors_repeat(self) -> bool:
-        """Whether the next sighting of the landmark has much the same error."""
-        ...
-
-    @property
-    def observes_yaw(self) -> bool:
-        """Whether it determines the yaw by itself."""
-        ...
-
-    @property
-    def variable_dof(self) -> int:
-        """Numbers of its landmark as a variable, where no map is known: 2 of a point, 3 of a pose; 0: never one."""
-        ...
-
-    @property
-    def bias_key(self) -> Hashable | None:
-        """Measurements of one key are tested for a common bias; None: there is no such test."""
-        ...
-
-    @property
-    def dof(self) -> int:
-        """Length of the residual."""
-        ...
-
-    @property
-    def information(self) -> float:
-        """Weight in comparison with others of its kind."""
-        ...
+    is_point: ClassVar[bool] = False
+    in_pixels: ClassVar[bool] = False
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure, by which the residual depends on the clock.
+        """Copy with the motion at the exposure, by which the residual depends on the clock; itself: it is as given.
 
         Args:
             twist: ``(3,)`` of the base [m/s, m/s, rad/s].
             offset_s: how late the stamp was taken to be.
             jitter_s: sigma of each stamp on its own; used for corners.
         """
-        ...
+        return self
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
         """The measurement, moved to the keyframe.
@@ -156,18 +89,19 @@ class LandmarkMeasurement(Protocol):
             motion: ``T_keyframe_then`` ``(3,)``: the base at the measurement's time, seen from the keyframe.
             cov: ``(3, 3)`` covariance of that motion (right perturbation); added to what the measurement itself has.
         """
-        ...
+        raise NotImplementedError
 
     def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
         """Copy with distance and bearing corrected by the settings of `LandmarksConfig` that a run estimates.
 
-        The built-in sensors of landmarks have applied them already.
+        The built-in sensors of landmarks have applied them already. Corners, and functions of the pose, are as given:
+        the camera, or their sensor, has a calibration of its own.
         """
-        ...
+        return self
 
     def scaled(self, factor: float) -> Self:
         """Copy with the covariance of the residual multiplied by a factor."""
-        ...
+        raise NotImplementedError
 
     def poses(self, landmarks: Mapping[int, Landmark]) -> Iterable[FloatArray]:
         """Poses ``(3,)`` of the base in the map from which the search for its place begins; none of a point.
@@ -175,58 +109,39 @@ class LandmarkMeasurement(Protocol):
         Args:
             landmarks: of the map, by id; that of the measurement is among them.
         """
-        ...
+        raise NotImplementedError
 
     def landmark_from(self, pose: FloatArray) -> FloatArray | None:
         """Landmark as seen from a pose ``(3,)``: point ``(2,)`` or pose ``(3,)``; None: it is never a variable."""
-        ...
+        return None
 
     def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
         """Other interpretations, most probable first, tried where the chi-square gate rejects the measurement.
 
         Args:
-            predicted: pose ``(3,)`` at the keyframe.
+            predicted: pose ``(3,)`` at the keyframe; see `PoseMeasurement.residual_at_keyframe`.
         """
-        ...
+        return ()
 
     def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """The measurement as one of other landmarks, of each that lies about where it was seen.
+        """The measurement as one of other landmarks, of each that lies about where it was seen; none: it is of its own.
 
         Args:
             ids: ``(n,)`` of those that it may be.
             places: ``(n, 3)`` theirs in the axes of the base.
         """
-        ...
-
-
-class LandmarkSighting(LandmarkMeasurement, Protocol):
-    """Measurement of a landmark of the map."""
-
-    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """Copy for a base tilted by ``T`` ``(4, 4)``, at roll and pitch rates ``(2,)`` [rad/s]; only corners change."""
-        ...
-
-    def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
-        """Place ``(3,)`` in the sensor's axes, noise of bearing [rad] and range [m]; None: no place explains it.
-
-        Args:
-            landmark: of the map; corners need it.
-            T_base_sensor: ``(4, 4)`` of what was measured in the plane; its height is taken to be the sensor's.
-        """
-        ...
+        return ()
 
 
 # --- What sightings of landmarks have in common -----------------------------------------------------------------------
 
 
-class _OfLandmark:
+class _OfLandmark(Measured):
     """Properties that are alike for all sightings of landmarks of the map."""
 
     __slots__ = ()
 
     of_landmark: ClassVar[bool] = True
-    is_point: ClassVar[bool] = False
-    in_pixels: ClassVar[bool] = False
     observes_yaw: ClassVar[bool] = True
     bias_key: ClassVar[None] = None
 
@@ -242,17 +157,18 @@ class _OfLandmark:
         """Id of the landmark."""
         return self.landmark_id
 
-    def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
-        """The sighting itself: corners have the camera's calibration."""
+    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
+        """Copy for a base tilted by ``T`` ``(4, 4)``, at roll and pitch rates ``(2,)`` [rad/s]; only corners change."""
         return self
 
-    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No alternatives but other ids; see `misread`."""
-        return ()
+    def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
+        """Place ``(3,)`` in the sensor's axes, noise of bearing [rad] and range [m]; None: no place explains it.
 
-    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No other readings: the sensor's own association is taken as it is."""
-        return ()
+        Args:
+            landmark: of the map; corners need it.
+            T_base_sensor: ``(4, 4)`` of what was measured in the plane; its height is taken to be the sensor's.
+        """
+        raise NotImplementedError
 
 
 class _InPlane(_OfLandmark):
@@ -272,12 +188,8 @@ class _InPlane(_OfLandmark):
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
+        """Copy with the motion at the exposure; see `Measured.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s)  # type: ignore[type-var]
-
-    def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """The sighting itself: it is taken to be in the plane."""
-        return self
 
     def scaled(self, factor: float) -> Self:
         """Copy with the covariance multiplied by a factor."""
@@ -331,16 +243,16 @@ class PixelMeasurement(_OfLandmark):
         return 1.0 / self.sigma_px**2
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """Copy with the motion at the exposure; see `LandmarkMeasurement.exposed`."""
+        """Copy with the motion at the exposure; see `Measured.exposed`."""
         return replace(self, twist=twist, offset_s=offset_s, jitter_s=jitter_s)
 
     def tilted(self, T: FloatArray, rates: FloatArray) -> Self:
-        """Copy as seen from a tilted base; see `LandmarkSighting.tilted`."""
+        """Copy as seen from a tilted base; see `_OfLandmark.tilted`."""
         camera = replace(self.camera, T_base_cam=T @ self.camera.T_base_cam)
         return replace(self, camera=camera, tilting=rates)
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
-        """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        """The sighting, moved to the keyframe; see `Measured.compensated`."""
         ad = se2.adjoint(motion)
         x, y, yaw = motion
         T = np.eye(4)
@@ -359,9 +271,6 @@ class PixelMeasurement(_OfLandmark):
         landmark = landmarks[self.landmark_id]
         return (pose for pose, _ in planar_base_candidates(self.camera, self.corners_px, landmark))
 
-    def landmark_from(self, pose: FloatArray) -> None:
-        """None: markers need a known map to be seen by their corners."""
-
     def misread(self, ids: IntArray, places: FloatArray) -> list[PixelMeasurement]:
         """The same corners with other ids, of markers whose middle lies in about the same direction."""
         T, K = self.camera.T_base_cam, self.camera.K
@@ -373,7 +282,7 @@ class PixelMeasurement(_OfLandmark):
         return [replace(self, landmark_id=i) for i in ids[ahead][across < _LOOKALIKE].tolist()]
 
     def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
-        """Place of the marker in the camera, by the better of its two poses; see `LandmarkSighting.relative`."""
+        """Place of the marker in the camera, by the better of its two poses; see `_OfLandmark.relative`."""
         assert landmark is not None
         found = marker_pose_candidates(self.camera, self.corners_px, landmark.size_m)
         if not found:
@@ -429,7 +338,7 @@ class PointMeasurement(_InPlane):
         return self.landmark_id == UNNAMED
 
     def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
-        """Copy with range and bearing corrected; see `LandmarkMeasurement.calibrated`."""
+        """Copy with range and bearing corrected; see `Measured.calibrated`."""
         bearing, scale = self.bearing_rad - bearing_bias_rad, np.array([1.0, range_scale])
         cov = self.cov * np.outer(scale, scale)
         return replace(self, range_m=range_scale * self.range_m, bearing_rad=bearing, cov=cov)
@@ -440,7 +349,7 @@ class PointMeasurement(_InPlane):
         return np.array([self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)])
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
-        """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        """The sighting, moved to the keyframe; see `Measured.compensated`."""
         ad = se2.adjoint(motion)
         x, y = self.point
         px, py, _ = se2.compose(motion, (x, y, 0.0))
@@ -476,7 +385,7 @@ class PointMeasurement(_InPlane):
         return np.array([r * c, r * s]), 0.5 * (cov + cov.T)
 
     def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
-        """Place in the sensor's axes with the noise of bearing and range; see `LandmarkSighting.relative`."""
+        """Place in the sensor's axes with the noise of bearing and range; see `_OfLandmark.relative`."""
         x, y = self.range_m * math.cos(self.bearing_rad), self.range_m * math.sin(self.bearing_rad)
         sigma_rad, sigma_m = np.sqrt(np.diag(self.cov)).tolist()
         return _in_sensor(x, y, T_base_sensor), sigma_rad, sigma_m
@@ -520,13 +429,13 @@ class FrameMeasurement(_InPlane):
     cauchy_k: float = 3.0  # as in PixelMeasurement
 
     def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
-        """Copy with distance, bearing and yaw corrected; see `LandmarkMeasurement.calibrated`."""
+        """Copy with distance, bearing and yaw corrected; see `Measured.calibrated`."""
         scale = np.array([range_scale, range_scale, 1.0])
         pose = se2.compose(np.array([0.0, 0.0, -bearing_bias_rad]), scale * self.pose)
         return replace(self, pose=pose, cov=self.cov * np.outer(scale, scale))
 
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
-        """The sighting, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        """The sighting, moved to the keyframe; see `Measured.compensated`."""
         pose = se2.compose(motion, self.pose)
         moved = se2.compose_cov(cov, self.pose, self.cov)
         return replace(self, pose=pose, cov=moved, twist=se2.adjoint(motion) @ self.twist)
@@ -546,7 +455,7 @@ class FrameMeasurement(_InPlane):
         return self.pose, np.linalg.inv(np.linalg.cholesky(self.cov)) @ turn
 
     def relative(self, landmark: Landmark | None, T_base_sensor: FloatArray) -> tuple[FloatArray, float, float] | None:
-        """Place in the sensor's axes, with the larger sigma of the position; see `LandmarkSighting.relative`."""
+        """Place in the sensor's axes, with the larger sigma of the position; see `_OfLandmark.relative`."""
         x, y = self.pose[:2]
         sigma_m = math.sqrt(max(self.cov[0, 0], self.cov[1, 1]))
         return _in_sensor(x, y, T_base_sensor), sigma_m / max(math.hypot(x, y), 0.1), sigma_m
@@ -556,7 +465,7 @@ class FrameMeasurement(_InPlane):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PoseMeasurement(ABC):
+class PoseMeasurement(Measured, ABC):
     """Measurement of a registered sensor, as a function of the robot's pose; each kind is a subclass.
 
     A subclass gives `residual_at`. Validation, motion compensation, the chi-square gate, the factor and the search for
@@ -566,9 +475,7 @@ class PoseMeasurement(ABC):
     model: ClassVar[Model] = Model.POSE
     of_landmark: ClassVar[bool] = False
     unnamed: ClassVar[bool] = False
-    is_point: ClassVar[bool] = False
     gives_pose: ClassVar[bool] = False
-    in_pixels: ClassVar[bool] = False
     errors_repeat: ClassVar[bool] = False
     variable_dof: ClassVar[int] = 0
 
@@ -600,14 +507,6 @@ class PoseMeasurement(ABC):
 
     def places(self) -> Iterable[FloatArray]:
         """Rough positions ``(2,)`` [m] of the robot in the map, from which the search for its first pose begins."""
-        return ()
-
-    def alternatives(self, predicted: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """Other interpretations of the reading, most probable first, tried where the chi-square gate rejects it.
-
-        Args:
-            predicted: pose ``(3,)`` at the keyframe; see `residual_at_keyframe`.
-        """
         return ()
 
     @property
@@ -645,19 +544,11 @@ class PoseMeasurement(ABC):
         """Weight in comparison with others of its kind."""
         return 1.0 / float(np.trace(self.cov[:2, :2]))
 
-    def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
-        """The measurement itself: the clock of its sensor is taken as given."""
-        return self
-
     def compensated(self, motion: FloatArray, cov: FloatArray) -> Self:
-        """The measurement, moved to the keyframe; see `LandmarkMeasurement.compensated`."""
+        """The measurement, moved to the keyframe; see `Measured.compensated`."""
         known = np.zeros((3, 3)) if self.motion_cov is None else self.motion_cov
         moved = se2.compose_cov(cov, self.T_keyframe_then, known)
         return replace(self, T_keyframe_then=se2.compose(motion, self.T_keyframe_then), motion_cov=moved)
-
-    def calibrated(self, range_scale: float, bearing_bias_rad: float) -> Self:
-        """The measurement itself: its sensor has constants of its own."""
-        return self
 
     def scaled(self, factor: float) -> Self:
         """Copy with the covariance multiplied by a factor."""
@@ -667,14 +558,6 @@ class PoseMeasurement(ABC):
         """Each of `places` with `YAWS` yaws."""
         yaws = np.linspace(-np.pi, np.pi, YAWS, endpoint=False)
         return (np.array([*place, yaw]) for place in self.places() for yaw in yaws)
-
-    def landmark_from(self, pose: FloatArray) -> FloatArray | None:
-        """None: it is of no landmark."""
-        return None
-
-    def misread(self, ids: IntArray, places: FloatArray) -> Sequence[LandmarkMeasurement]:
-        """No other readings; see `alternatives`."""
-        return ()
 
     def residual_at_keyframe(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residual and Jacobian of `residual_at`, by the pose at the keyframe."""
@@ -687,6 +570,12 @@ class PoseMeasurement(ABC):
         """Residual and Jacobians of `by_constants`, by the pose at the keyframe and the constants."""
         residual, J, H = self.by_constants(se2.compose(pose, self.T_keyframe_then), values)
         return residual, np.asarray(J @ se2.adjoint(se2.inverse(self.T_keyframe_then))), H
+
+
+LandmarkSighting = PixelMeasurement | PointMeasurement | FrameMeasurement
+"""Measurement of a landmark of the map."""
+LandmarkMeasurement = LandmarkSighting | PoseMeasurement
+"""Any measurement of where the robot is."""
 
 
 # --- Those of one kind ------------------------------------------------------------------------------------------------

@@ -13,22 +13,21 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from fgloc import se2
 from fgloc.config import ODOMETRIES, Config, GateConfig, NoiseDensity, OdometryTopic
-from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.sensors.base import BASE, BuiltIn, EventInput, FoundRow, MotionInstallation, Parameter, Rank, Stream
 from fgloc.sensors.failures import Change, EventFailure, Failure, Scene
 from fgloc.sensors.wheels.events import (
-    NOT_GIVEN,
     OdometryChecks,
     PoseAndTwistEvent,
     odometry_converters,
     odometry_validator,
+    planar,
 )
 from fgloc.sensors.wheels.failures import JoinedWheels
 from fgloc.types import Event, FloatArray, IntArray, MotionMeasurement, Step
@@ -61,16 +60,10 @@ class OdometriesInput(EventInput):
             twist: forward, left [m/s], yaw rate [rad/s]; None: it has none.
             twist_cov: ``(3, 3)`` of the twist; None: not known.
         """
-        unknown = (math.nan,) * 3
-        x, y, yaw = unknown if pose is None else pose
-        vx, vy, w = unknown if twist is None else twist
-        cov = np.zeros((6, 6)) if twist is not None else NOT_GIVEN
+        known = planar(pose, twist)
         if twist_cov is not None and twist is not None:
-            cov[np.ix_(_ROS, _ROS)] = twist_cov
-        orientation = np.full(4, np.nan) if math.isnan(yaw) else yaw_quaternion(float(yaw))
-        moved = np.array([x, y, 0.0]), orientation, np.zeros((6, 6)) if pose is not None else NOT_GIVEN
-        when = self._when(f"odometry.{name}", stamp_ns)
-        self._deliver(BesideEvent(*when, name, BASE, *moved, np.array([vx, vy, 0.0]), np.array([0.0, 0.0, w]), cov))
+            known[-1][np.ix_(_ROS, _ROS)] = twist_cov
+        self._deliver(BesideEvent(*self._when(f"odometry.{name}", stamp_ns), name, BASE, *known))
 
 
 # --- Constants of the installation ------------------------------------------------------------------------------------
@@ -175,7 +168,7 @@ _HOLD_NS = 300_000_000  # a twist holds for so long beyond its message; after it
 _KEEP = 4096  # newest pieces: more than 10 s at 200 Hz
 _JUMP_M, _JUMP_RAD = 0.1, 0.2  # of a pose, off what its twist makes of the interval
 _BEGINS_M = 0.5  # from its origin: there an odometry is that was started just now
-_DENSITY = NoiseDensity()
+_DENSITY = NoiseDensity()  # usual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,11 +267,9 @@ class BesideOdometry:
     def _twist(self, at_ns: int) -> FloatArray:
         """Reported twist ``(3,)`` at a time: the mean of the pieces before and after."""
         k = bisect_right(self._pieces, at_ns, key=lambda p: p.start_ns)
-        near = self._pieces[max(k - 2, 0) : k + 1] if abs(at_ns - self._start_of(k)) < _HOLD_NS else []
+        begun_ns = self._pieces[k - 1].start_ns if k > 0 else 0
+        near = self._pieces[max(k - 2, 0) : k + 1] if abs(at_ns - begun_ns) < _HOLD_NS else []
         return np.asarray(np.mean([p.twist for p in near], axis=0)) if near else np.zeros(3)
-
-    def _start_of(self, k: int) -> int:
-        return self._pieces[k - 1].start_ns if k > 0 else 0
 
     def _over(self, step: Step) -> Iterator[_Piece]:
         """Pieces that reach into a step, in order; the last one may hold beyond its end."""
@@ -319,7 +310,7 @@ class BesideOdometry:
 
 
 def _pose(event: BesideEvent) -> FloatArray | None:
-    pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+    pose = event.pose
     return None if np.isnan(pose).any() else pose
 
 
@@ -333,16 +324,7 @@ def _density(event: BesideEvent, twist: FloatArray, seconds: float) -> FloatArra
     cov = event.twist_cov[np.ix_(_ROS, _ROS)]
     if (np.diag(cov) > 0.0).all():
         return np.asarray(cov * seconds)
-    speed, turn = float(np.hypot(*twist[:2])), abs(float(twist[2]))
-    d = _DENSITY
-    xy = d.xy_per_sqrt_rad**2 * turn + d.xy_per_sqrt_s**2
-    return np.diag(
-        [
-            d.x_per_sqrt_m**2 * speed + xy,
-            d.y_per_sqrt_m**2 * speed + xy,
-            d.yaw_per_sqrt_m**2 * speed + d.yaw_per_sqrt_rad**2 * turn + d.yaw_per_sqrt_s**2,
-        ]
-    )
+    return np.diag(_DENSITY.per_second(float(np.hypot(*twist[:2])), float(twist[2])))
 
 
 # --- Failures for `fgloc ablate` --------------------------------------------------------------------------------------
@@ -351,11 +333,8 @@ def _density(event: BesideEvent, twist: FloatArray, seconds: float) -> FloatArra
 class BesideFrozen(EventFailure):
     """Odometries beside the wheels repeat their last pose, at rest, with new stamps."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (BesideEvent,)
     kind: Literal["odometries_frozen"] = "odometries_frozen"
-
-    def targets(self) -> tuple[type[Event], ...]:
-        """Their messages."""
-        return (BesideEvent,)
 
     def begin(self, scene: Scene) -> Change:
         """Return the function that repeats the first pose of each topic."""
@@ -389,11 +368,10 @@ class BesideJump(Failure):
                 yield event
                 continue
             self.touch(scene)
-            pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+            pose = event.pose
             for _ in range(jumps):
                 pose = se2.compose((self.distance_m, 0.0, self.yaw_rad), pose)
-            position = np.array([pose[0], pose[1], event.position[2]])
-            yield replace(event, position=position, orientation=yaw_quaternion(float(pose[2])))
+            yield event.with_pose(pose)
 
 
 # --- The sensor -------------------------------------------------------------------------------------------------------

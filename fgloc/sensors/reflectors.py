@@ -185,7 +185,7 @@ def _least_intensity(values: FloatArray) -> float | None:
 
 def _first_section(look: FirstLook) -> FirstSection:
     """Intensity of reflectors, used where nothing else sees the points of the map; else a proposal."""
-    scans = [e for e in look.events[ScanEvent] if isinstance(e, ScanEvent) and e.intensities.any()]
+    scans = [e for e in look.of(ScanEvent) if e.intensities.any()]
     if not scans:
         return FirstSection()
     values = np.concatenate([e.intensities for e in scans[:: -(-len(scans) // _SCANS)]])
@@ -193,7 +193,7 @@ def _first_section(look: FirstLook) -> FirstSection:
     if least is None:
         return FirstSection()
     landmarks = look.landmark_map.landmarks.values() if look.landmark_map is not None else ()
-    seen_otherwise = {role.rpartition("/")[2] for role in look.roles} & {"image", "sightings"}
+    seen_otherwise = look.kinds & {"image", "sightings"}
     asked = any(m.is_point for m in landmarks) and not seen_otherwise
     placed = scans[0].frame_id in look.recording.frames
     hits = np.mean([len(spots(e, least, ReflectorsConfig().size_m)[0]) for e in scans])

@@ -35,7 +35,7 @@ from pydantic import Field
 from fgloc.config import GateConfig, Section
 from fgloc.errors import ConfigError
 from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, FoundRow, Parameter, Stream, When
-from fgloc.sensors.failures import Change, EventFailure, Scene
+from fgloc.sensors.failures import EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, Landmark, SensorEvent
 
@@ -176,22 +176,14 @@ class UwbRange(PoseMeasurement):
 class NonLineOfSight(EventFailure):
     """Ranges are too long, each by a draw of its own, exponentially distributed."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (UwbEvent,)
     sizes: ClassVar[tuple[str, ...]] = ("mean_m",)
     kind: Literal["uwb_non_line_of_sight"] = "uwb_non_line_of_sight"
     mean_m: float = Field(1.0, gt=0, description="mean excess of a range [m]")
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Ranges."""
-        return (UwbEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Lengthen one."""
-
-        def lengthen(event: Event) -> Event:
-            assert isinstance(event, UwbEvent)
-            return replace(event, range_m=event.range_m + scene.rng.exponential(self.mean_m))
-
-        return lengthen
+    def change(self, event: UwbEvent, scene: Scene) -> Event:
+        """Lengthen one range."""
+        return replace(event, range_m=event.range_m + scene.rng.exponential(self.mean_m))
 
 
 # --- First settings ---------------------------------------------------------------------------------------------------
@@ -203,12 +195,12 @@ _FAR = 1.2  # times the longest range but one in a hundred: bound of ranges
 
 def _first_section(look: FirstLook) -> FirstSection:
     """Anchors by the map, where nothing else can see what is in it, noise and bound of the ranges."""
-    events = [e for e in look.events[UwbEvent] if isinstance(e, UwbEvent) and math.isfinite(e.range_m)]
+    events = [e for e in look.of(UwbEvent) if math.isfinite(e.range_m)]
     if not events:
         return FirstSection()
     numbers = sorted({event.anchor for event in events})
     given = look.landmark_map.landmarks if look.landmark_map is not None else {}
-    seen_otherwise = {role.rpartition("/")[2] for role in look.roles} & {"image", "sightings"}
+    seen_otherwise = look.kinds & {"image", "sightings"}
     places = {} if seen_otherwise else {i: given[i] for i in numbers if i in given}
     shown = ", ".join(map(str, numbers[:12]))
     if len(places) >= _LEAST_ANCHORS:
@@ -306,7 +298,7 @@ class Uwb:
                 self._unknown.add(event.anchor)
             return
         config = self._config
-        line_of_sight = UwbRange(
+        in_sight = UwbRange(
             source="uwb",
             stamp_ns=event.stamp_ns,
             cov=np.array([[config.sigma_m**2]]),
@@ -316,15 +308,11 @@ class Uwb:
             tag=self._tag,
             constants=(SCALE, BIAS, *(place_parameters(event.anchor) if event.anchor in self._sigmas else ())),
         )
-        yield (
-            line_of_sight
-            if config.non_line_of_sight == "reject"
-            else replace(line_of_sight, behind_obstacle=self._too_long(line_of_sight))
-        )
-
-    def _too_long(self, m: UwbRange) -> UwbRange:
-        sigma = self._config.nlos_sigma_m
-        return replace(m, source="uwb_nlos", range_m=m.range_m - self._config.nlos_bias_m, cov=np.array([[sigma**2]]))
+        if config.non_line_of_sight == "reject":
+            yield in_sight
+            return
+        range_m, cov = in_sight.range_m - config.nlos_bias_m, np.array([[config.nlos_sigma_m**2]])
+        yield replace(in_sight, behind_obstacle=replace(in_sight, source="uwb_nlos", range_m=range_m, cov=cov))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

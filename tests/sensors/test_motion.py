@@ -20,7 +20,6 @@ from fgloc.sensors.learned.network import (
     MotionModel,
     NaiveModel,
     VelocityModel,
-    noise_density,
 )
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
 from fgloc.types import ControlEvent, Step, by_class
@@ -244,7 +243,7 @@ def test_noise_density_adds_up() -> None:
         x_per_sqrt_m=1.0, y_per_sqrt_m=2.0, yaw_per_sqrt_m=3.0, xy_per_sqrt_rad=4.0, yaw_per_sqrt_rad=5.0,
         xy_per_sqrt_s=6.0, yaw_per_sqrt_s=7.0,
     )  # fmt: skip
-    np.testing.assert_allclose(noise_density(noise, -0.5, -0.1), [38.1, 39.6, 56.0])
+    np.testing.assert_allclose(noise.per_second(-0.5, -0.1), [38.1, 39.6, 56.0])
 
 
 def test_prediction_needs_a_command_and_a_length(rng: np.random.Generator, tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ class SensorRecord:
     def signals(self, wanted: tuple[str, ...], origin_ns: int) -> Signals:
         """The wanted signals over the whole recording."""
         events = {InertialEvent: self._all(ImuEvent), JointsEvent: self._all(JointsEvent)}
-        return signals_of(wanted, events.__getitem__, origin_ns, Mounting(self.joints, self._biases, self.imu_up))
+        return signals_of(wanted, events, origin_ns, Mounting(self.joints, self._biases, self.imu_up))
 
     def _stamps(self, kind: type[MotionEvent]) -> list[int]:
         return self._buffers[kind].stamps

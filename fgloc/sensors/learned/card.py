@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated, Literal
@@ -48,17 +48,6 @@ FAMILIES: dict[Kind, Family] = {
 }
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Share = Annotated[FiniteFloat, Field(lt=1)]
-
-
-def _needs(kind: Kind) -> str:
-    lag = "no lag" if kind in ("naive", "rate") else "a lag"
-    return f"{lag} and the noise densities of its error"
-
-
-def _increasing(edges: tuple[float, ...]) -> tuple[float, ...]:
-    if len(edges) < 2 or edges[0] < 0 or any(b <= a for a, b in pairwise(edges)):
-        raise ValueError(f"expected at least two increasing ages >= 0, got {edges}")
-    return edges
 
 
 class Kinematics(Section):
@@ -206,11 +195,16 @@ class ModelCard(Section):
                 f"hidden is {self.hidden}; naive, lag and arx models have no hidden layer, others have one"
             )
         if self.family == "displacement":
-            _increasing(self.edges_s)
+            edges = self.edges_s
+            if len(edges) < 2 or edges[0] < 0 or any(b <= a for a, b in pairwise(edges)):
+                raise ValueError(f"expected at least two increasing ages >= 0, got {edges}")
             if self.signal_edges_s[:1] != (0.0,) or any(b <= a for a, b in pairwise(self.signal_edges_s)):
                 raise ValueError(f"signal_edges_s: expected ages that increase from 0, got {self.signal_edges_s}")
         elif self.noise is None or (self.lag is None) != (self.kind in ("naive", "rate")):
-            raise ValueError(f"a {self.kind} model needs {_needs(self.kind)}; the card does not fit")
+            lag = "no lag" if self.kind in ("naive", "rate") else "a lag"
+            raise ValueError(
+                f"a {self.kind} model needs {lag} and the noise densities of its error; the card does not fit"
+            )
         if self.members > 1 and self.kind != "displacement":
             raise ValueError(f"a {self.kind} model has one network, the card says {self.members}")
         for channel in (CHANNELS[name] for name in self.measured):
@@ -237,10 +231,6 @@ class ModelCard(Section):
             if len(values) != wanted:
                 raise ValueError(f"normalization {name} has {len(values)} values, the inputs and outputs need {wanted}")
         return self
-
-
-EventsOf = Callable[[type[MotionEvent]], Sequence[MotionEvent]]
-"""Events of a class, in order of stamp."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,7 +288,7 @@ class SignalReader:
                 events.clear()
             _follow(events, step.of(kind), oldest)
         mounting = replace(self._mounting, gyro_bias=gyro_bias)
-        found = signals_of(self._wanted, self._events.__getitem__, step.start_ns, mounting)
+        found = signals_of(self._wanted, self._events, step.start_ns, mounting)
         for name in self._wanted:
             signal = found.named(name)
             if signal is None or not signal.covers(0.0, step.dt):
@@ -306,17 +296,22 @@ class SignalReader:
         return found
 
 
-def signals_of(wanted: Sequence[str], events_of: EventsOf, origin_ns: int, mounting: Mounting) -> Signals:
+def signals_of(
+    wanted: Sequence[str],
+    events: Mapping[type[MotionEvent], Sequence[MotionEvent]],
+    origin_ns: int,
+    mounting: Mounting,
+) -> Signals:
     """The wanted signals, as far as the events hold them.
 
     Args:
         wanted: names of channels.
-        events_of: the events by class.
+        events: by class, in order of stamp.
         origin_ns: time zero of the signals.
         mounting: what the channels need to know of the robot.
     """
     channels = [CHANNELS[name] for name in wanted]
-    made = {channel.name: channel.signal(events_of(channel.event), origin_ns, mounting) for channel in channels}
+    made = {channel.name: channel.signal(events[channel.event], origin_ns, mounting) for channel in channels}
     return Signals(origin_ns, {name: signal for name, signal in made.items() if signal is not None})
 
 

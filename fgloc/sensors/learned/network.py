@@ -7,9 +7,9 @@ time and two halves give what the whole gives.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,12 +24,11 @@ from fgloc.types import ControlEvent, FloatArray, MotionMeasurement
 Float32Array = NDArray[np.float32]
 
 
-class Answering(Protocol):
-    """Any network: inputs ``(rows, in)`` to outputs ``(rows, out)``, or ``(members, rows, out)`` of an ensemble."""
+Answering = Callable[[Float32Array], Float32Array]
+"""Any network: inputs ``(rows, in)`` to outputs ``(rows, out)``, or ``(members, rows, out)`` of an ensemble.
 
-    def __call__(self, x: Float32Array) -> Float32Array:
-        """Perhaps not finite; the next call overwrites the result."""
-        ...
+They are perhaps not finite; the next call overwrites them.
+"""
 
 
 class Network:
@@ -91,16 +90,6 @@ class Network:
         return x
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cell:
-    """Weights of the unit, torch's layout: rows of the reset gate, the update gate, then the candidate."""
-
-    weight_ih: Float32Array  # (3 h, 2)
-    weight_hh: Float32Array  # (3 h, h)
-    bias_ih: Float32Array  # (3 h,)
-    bias_hh: Float32Array  # (3 h,)
-
-
 class RecurrentNetwork:
     """The commands of the age bins, oldest first, through the cell; its last state and the other inputs to the layers.
 
@@ -108,12 +97,18 @@ class RecurrentNetwork:
     """
 
     def __init__(
-        self, cell: Cell, head: Network, n_bins: int, mean: NDArray[np.float64], std: NDArray[np.float64]
+        self,
+        cell: Sequence[Float32Array],
+        head: Network,
+        n_bins: int,
+        mean: NDArray[np.float64],
+        std: NDArray[np.float64],
     ) -> None:
         """Take the parts.
 
         Args:
-            cell: reads two numbers at a time.
+            cell: weights that read two numbers ``(3 h, 2)`` and the state ``(3 h, h)``, and the biases ``(3 h,)`` of
+                both, in torch's layout: rows of the reset gate, the update gate, then the candidate.
             head: of the last state and the normalized other inputs.
             n_bins: age bins of two commands each, with which the inputs begin, youngest first.
             mean: ``(in,)`` of the inputs.
@@ -124,13 +119,14 @@ class RecurrentNetwork:
 
     def __call__(self, x: Float32Array) -> Float32Array:
         """Outputs ``(rows, out)`` of inputs ``(rows, in)``, perhaps not finite; the next call overwrites them."""
-        c, width = self._cell, len(self._cell.bias_ih) // 3
+        weight_ih, weight_hh, bias_ih, bias_hh = self._cell
+        width = len(bias_ih) // 3
         normal = (x - self._mean) / self._std
         state = np.zeros((len(x), width), dtype=np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
             for k in range(self._n_bins - 1, -1, -1):
-                read = normal[:, 2 * k : 2 * k + 2] @ c.weight_ih.T + c.bias_ih
-                kept = state @ c.weight_hh.T + c.bias_hh
+                read = normal[:, 2 * k : 2 * k + 2] @ weight_ih.T + bias_ih
+                kept = state @ weight_hh.T + bias_hh
                 gates = _sigmoid(read[:, : 2 * width] + kept[:, : 2 * width])
                 reset, update = gates[:, :width], gates[:, width:]
                 candidate = np.tanh(read[:, 2 * width :] + reset * kept[:, 2 * width :])
@@ -335,11 +331,14 @@ class MotionPrediction:
     velocity: FloatArray  # (2,) v [m/s], ω [rad/s]
 
 
-class MotionModel(Protocol):
-    """Interface of a learned model: its card, its calibration against the wheels, and its predictions."""
+class MotionModel(ABC):
+    """A learned model: its card, its calibration against the wheels, and its predictions."""
 
-    card: ModelCard
-    joint: JointCalibration | None
+    def __init__(self, card: ModelCard) -> None:
+        """Take a checked card."""
+        self.card = card
+        self.joint = None if card.joint is None else JointCalibration(card.joint.W, card.joint.N, card.joint.C)
+        self._track: CommandHistory | None = None
 
     def predict(
         self,
@@ -364,7 +363,23 @@ class MotionModel(Protocol):
         Raises:
             ModelError: there is no command, the step has no length, or a signal that the model reads is not given.
         """
-        ...
+        if not commands:
+            raise ModelError("no command to predict from; the step needs the last command at or before its start")
+        if end_ns <= start_ns:
+            raise ModelError(f"the step ends at {end_ns} ns, not after its start {start_ns} ns")
+        self._track = CommandHistory(commands) if self._track is None else self._track.following(commands)
+        return self._predict(self._track, start_ns, (end_ns - start_ns) * 1e-9, velocity, signals)
+
+    @abstractmethod
+    def _predict(
+        self,
+        track: CommandHistory,
+        start_ns: int,
+        duration: float,
+        velocity: FloatArray | None,
+        signals: Signals | None,
+    ) -> MotionPrediction | None:
+        """Motion over a duration [s], by the track of the commands; the rest as `predict` has it."""
 
 
 def calibrated(kinematics: Kinematics, track: CommandHistory, limits: FloatArray) -> FloatArray:
@@ -378,14 +393,6 @@ def gains(kinematics: Kinematics) -> FloatArray:
     v, left = kinematics.scale_v, kinematics.scale_vy
     rows = [[v, 0.0, kinematics.yaw_per_m * v], [0.0, 0.0, kinematics.scale_omega], [0.0, left, 0.0]]
     return np.array(rows if left > 0.0 else rows[:2])
-
-
-def noise_density(noise: NoiseDensity, v: float, omega: float) -> tuple[float, float, float]:
-    """Variances per second of x, y, yaw at a velocity."""
-    v, omega = abs(v), abs(omega)
-    turning = noise.xy_per_sqrt_rad**2 * omega + noise.xy_per_sqrt_s**2
-    yaw = noise.yaw_per_sqrt_m**2 * v + noise.yaw_per_sqrt_rad**2 * omega + noise.yaw_per_sqrt_s**2
-    return noise.x_per_sqrt_m**2 * v + turning, noise.y_per_sqrt_m**2 * v + turning, yaw
 
 
 def composed(twists: Iterable[Triple], variances: Iterable[Triple]) -> tuple[FloatArray, FloatArray]:
@@ -421,58 +428,34 @@ def composed(twists: Iterable[Triple], variances: Iterable[Triple]) -> tuple[Flo
     return np.array([x, y, se2.wrap(yaw)]), np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 
-def joint_of(card: ModelCard) -> JointCalibration | None:
-    """The card's calibration against the wheels, ready for use."""
-    return None if card.joint is None else JointCalibration(card.joint.W, card.joint.N, card.joint.C)
-
-
-def duration_of(commands: tuple[ControlEvent, ...], start_ns: int, end_ns: int) -> float:
-    """Length of the step [s]; raises `ModelError` if there is none, or no command."""
-    if not commands:
-        raise ModelError("no command to predict from; the step needs the last command at or before its start")
-    if end_ns <= start_ns:
-        raise ModelError(f"the step ends at {end_ns} ns, not after its start {start_ns} ns")
-    return (end_ns - start_ns) * 1e-9
-
-
-def follow(track: CommandHistory | None, commands: tuple[ControlEvent, ...]) -> CommandHistory:
-    """The track of these commands, continued from the last step's where it can be."""
-    return CommandHistory(commands) if track is None else track.following(commands)
-
-
 def sub_steps(duration: float, longest_s: float) -> int:
     """Number of equal parts of a duration [s], none of which is longer than ``longest_s``."""
     return max(1, math.ceil(duration / longest_s - 1e-6))
 
 
-class NaiveModel:
+class NaiveModel(MotionModel):
     """The robot moves as commanded: v = u, in the model's kinematics. The baseline."""
 
     def __init__(self, card: ModelCard) -> None:
         """Take a checked card."""
-        self.card = card
-        self.joint = joint_of(card)
+        super().__init__(card)
         self._noise = _noise(card)
-        self._track: CommandHistory | None = None
 
-    def predict(
+    def _predict(
         self,
-        commands: tuple[ControlEvent, ...],
+        track: CommandHistory,
         start_ns: int,
-        end_ns: int,
+        duration: float,
         velocity: FloatArray | None,
-        signals: Signals | None = None,
+        signals: Signals | None,
     ) -> MotionPrediction | None:
-        """Motion over ``[start_ns, end_ns]``; see `MotionModel.predict`."""
-        duration = duration_of(commands, start_ns, end_ns)
-        track = self._track = follow(self._track, commands)
         n = sub_steps(duration, self.card.dt_s)
         limits = (start_ns - track.origin_ns) * 1e-9 + duration / n * np.arange(n + 1, dtype=np.float64)
         twists = calibrated(self.card.kinematics, track, limits)
         return _prediction(twists, self._noise, duration / n, twists[-1, ::2])
 
 
-class VelocityModel:
+class VelocityModel(MotionModel):
     """The paper's model: ``[v, ω]ₖ₊₁ = F(v, ω, u_v, u_ω, Δt)``, rolled out, kinematics known.
 
     F is a first-order lag towards the calibrated commands plus Δt times a network, so that Δt may vary and the network
@@ -483,27 +466,22 @@ class VelocityModel:
 
     def __init__(self, card: ModelCard, network: Answering | None) -> None:
         """Take a checked card and its network; None for a ``lag`` model."""
-        self.card = card
-        self.joint = joint_of(card)
+        super().__init__(card)
         self._network = network
         self._noise = _noise(card)
         self._lag = None if card.lag is None else np.array(card.lag.lag_s)
         self._delay = card.kinematics.delay_s if card.lag is None else card.lag.delay_s
         self._scale = np.array(card.output_scale)
         self._gains = gains(card.kinematics)
-        self._track: CommandHistory | None = None
 
-    def predict(
+    def _predict(
         self,
-        commands: tuple[ControlEvent, ...],
+        track: CommandHistory,
         start_ns: int,
-        end_ns: int,
+        duration: float,
         velocity: FloatArray | None,
-        signals: Signals | None = None,
+        signals: Signals | None,
     ) -> MotionPrediction | None:
-        """Motion over ``[start_ns, end_ns]``; see `MotionModel.predict`."""
-        duration = duration_of(commands, start_ns, end_ns)
-        track = self._track = follow(self._track, commands)
         start = (start_ns - track.origin_ns) * 1e-9
         if velocity is None:
             velocity = self._roll(track, start - self.card.history_s, self.card.history_s, np.zeros(2))[-1]
@@ -545,7 +523,7 @@ def _noise(card: ModelCard) -> NoiseDensity:
 
 def _prediction(twists: FloatArray, noise: NoiseDensity, dt: float, velocity: FloatArray) -> MotionPrediction:
     """Motion of body twists ``(n, 3)``, each held for ``dt`` [s], with covariance."""
-    variances = np.array([noise_density(noise, v, omega) for v, omega in twists[:, ::2].tolist()])
+    variances = np.array([noise.per_second(v, omega) for v, omega in twists[:, ::2].tolist()])
     return MotionPrediction(*composed((twists * dt).tolist(), (variances * dt).tolist()), velocity)
 
 
@@ -554,7 +532,7 @@ _MAX_LOG_VARIANCE = 10.0
 _DISAGREEMENT_S = 1.0  # members differ for about this long at a time: a rate of spread s has the density 2 s² times it
 
 
-class DisplacementModel:
+class DisplacementModel(MotionModel):
     """A residual twist on the best known kinematics, with its own log-variance.
 
     The twist of each sub-step follows from the mean commands of the card's age bins and, if the model was trained with
@@ -567,8 +545,7 @@ class DisplacementModel:
 
     def __init__(self, card: ModelCard, network: Answering) -> None:
         """Take a checked card and its network, which knows the card's scales of the outputs."""
-        self.card = card
-        self.joint = joint_of(card)
+        super().__init__(card)
         self._network = network
         self._gains = gains(card.kinematics)
         self._ages = np.array(card.edges_s)
@@ -581,19 +558,15 @@ class DisplacementModel:
         self._n_bins = 2 * len(self._widths)
         self._n_told = card.n_commands * len(self._widths)
         self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
-        self._track: CommandHistory | None = None
 
-    def predict(
+    def _predict(
         self,
-        commands: tuple[ControlEvent, ...],
+        track: CommandHistory,
         start_ns: int,
-        end_ns: int,
+        duration: float,
         velocity: FloatArray | None,
-        signals: Signals | None = None,
+        signals: Signals | None,
     ) -> MotionPrediction | None:
-        """Motion over ``[start_ns, end_ns]``; see `MotionModel.predict`."""
-        duration = duration_of(commands, start_ns, end_ns)
-        track = self._track = follow(self._track, commands)
         n = sub_steps(duration, self.card.dt_s)
         dt = duration / n
         base, x = self._inputs(track, (start_ns - track.origin_ns) * 1e-9, dt, n)

@@ -35,7 +35,6 @@ from fgloc.sensors.commands import told
 from fgloc.sensors.learned.card import FORMAT, VERSION, ModelCard, SignalReader
 from fgloc.sensors.learned.network import (
     Answering,
-    Cell,
     DisplacementModel,
     MotionModel,
     NaiveModel,
@@ -145,8 +144,7 @@ def _network(tensors: Tensors, card: ModelCard) -> Answering:
         return Network(layers, mean, std, scale, offset)
     width = _widths(card)[0]
     head = Network(layers, np.zeros(width), np.ones(width), scale, offset)
-    cell = Cell(*(tensors[f"gru.{name}"] for name in _CELL))
-    return RecurrentNetwork(cell, head, len(card.edges_s) - 1, mean, std)
+    return RecurrentNetwork([tensors[f"gru.{name}"] for name in _CELL], head, len(card.edges_s) - 1, mean, std)
 
 
 def _widths(card: ModelCard) -> list[int]:

@@ -32,7 +32,7 @@ from fgloc.sensors.markers.edges import (
     refine_all,
     subpixel,
 )
-from fgloc.sensors.markers.images import CornersEvent, GrayImage, ImageError, ImageEvent, MarkerCorners, decode
+from fgloc.sensors.markers.images import CornersEvent, GrayImage, ImageError, ImageEvent, MarkerCorners, decode, decoded
 from fgloc.types import Event, FloatArray, LandmarkMap, RawEvent, SightingsEvent
 
 _LOOKAHEAD = 4  # images that may be detected before the consumer asks for them
@@ -55,15 +55,11 @@ def use_one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def _of_one_camera(topic: str) -> Role:
-    return "image"
-
-
 def detect_stream(
     events: Iterable[Event],
     detector: Detector,
     rejections: Counter[str],
-    image_role: Callable[[str], Role] = _of_one_camera,
+    image_role: Callable[[str], Role] = lambda topic: "image",
 ) -> Iterator[Event]:
     """All events in their order, with a sightings event in the place of each image.
 
@@ -159,33 +155,6 @@ def turned_by_180(name: str) -> bool:
     return int("".join("1" if bit else "0" for bit in drawn), 2) != _TAG36H11_0
 
 
-def suggest(look: Callable[[str], tuple[list[int], int]]) -> str | None:
-    """The dictionary whose sightings are the least likely to be chance, in its smallest size that holds the ids.
-
-    Args:
-        look: gives, for a dictionary's name, the ids found, once for each sighting, and the number of squares tried.
-
-    Returns:
-        The name, or None if no dictionary's sightings are beyond chance.
-    """
-    families: dict[str, list[str]] = {}
-    for name in dictionary_names():
-        stem, _, count = name.rpartition("_")
-        families.setdefault(stem if count.isdigit() else name, []).append(name)
-    best, best_evidence = None, _LEAST_EVIDENCE_BITS
-    for names in families.values():
-        names.sort(key=lambda n: len(load_dictionary(n).bytesList))
-        ids, squares = look(names[-1])
-        by_chance = math.log2(
-            math.comb(max(squares, len(ids)), len(ids))
-        )  # the ways to pick the ones that read wrongly
-        evidence = len(ids) * _evidence_bits(load_dictionary(names[-1])) - by_chance
-        if evidence > best_evidence:
-            best_evidence = evidence
-            best = next(n for n in names if len(load_dictionary(n).bytesList) > max(ids))
-    return best
-
-
 def _evidence_bits(dictionary: cv2.aruco.Dictionary) -> float:
     """Negative binary logarithm of the probability that a random square reads as one of the markers [bits]."""
     bits = int(dictionary.markerSize) ** 2
@@ -248,8 +217,18 @@ class MarkerDetector:
         return RememberedDetections(file, detector, known, note)
 
     def hints(self, recording: Any) -> tuple[tuple[str, ...], str | None]:
-        """Hints on why no marker is found; see `fgloc.sensors.markers.detector.image_hints`."""
-        return image_hints(recording, self)
+        """Hints on why no marker is found, a sentence each: another dictionary, mirrored images, inverted prints.
+
+        Returns:
+            The sentences; and the dictionary, if it is another one.
+        """
+        images = _some_images(recording)
+        hints = list(dict.fromkeys(hint for image in images for hint in self.diagnose(image)))
+        fitting = None if any(self.find(image) for image in images) else suggest_dictionary(images)
+        if fitting is None or fitting == self.dictionary:
+            return tuple(hints), None
+        sentence = f"No marker of {self.dictionary} is seen, but of {fitting}: set markers.dictionary: {fitting}."
+        return (*hints, sentence), fitting
 
     def detect(self, event: ImageEvent) -> CornersEvent:
         """The markers of one image, ordered by id and place; an image without markers gives an event without sightings.
@@ -257,9 +236,7 @@ class MarkerDetector:
         Raises:
             ImageError: the image cannot be decoded.
         """
-        found = self.find(decode(event))
-        sightings = tuple(MarkerCorners(i, corners) for i, corners in found)
-        return CornersEvent(event.stamp_ns, event.received_ns, event.topic, event.frame_id, sightings)
+        return CornersEvent.found_in(event, (MarkerCorners(i, corners) for i, corners in self.find(decode(event))))
 
     def find(self, image: GrayImage) -> Found:
         """Id and corners ``(4, 2)`` of each marker in a gray image, ordered by id, then from the left."""
@@ -335,16 +312,28 @@ class MarkerDetector:
 
 
 def suggest_dictionary(images: Iterable[GrayImage]) -> str | None:
-    """The smallest predefined dictionary that fits what is seen in the images, or None if that could be chance."""
-    config = MarkersConfig()
-    gray = list(images)
+    """The smallest predefined dictionary that fits what is seen in the images, or None if that could be chance.
 
-    def look(name: str) -> tuple[list[int], int]:
-        detector = MarkerDetector(name, config)
+    It is the one whose sightings are the least likely to be chance, in its smallest size that holds the ids.
+    """
+    config, gray = MarkersConfig(), list(images)
+    families: dict[str, list[str]] = {}
+    for name in dictionary_names():
+        stem, _, count = name.rpartition("_")
+        families.setdefault(stem if count.isdigit() else name, []).append(name)
+    best, best_evidence = None, _LEAST_EVIDENCE_BITS
+    for names in families.values():
+        names.sort(key=lambda n: len(load_dictionary(n).bytesList))
+        detector = MarkerDetector(names[-1], config)
         looks = [detector.read(image) for image in gray]
-        return [i for found, _ in looks for i, _ in found], sum(squares for _, squares in looks)
-
-    return suggest(look)
+        ids = [i for found, _ in looks for i, _ in found]  # once for each sighting
+        squares = sum(tried for _, tried in looks)
+        by_chance = math.log2(math.comb(max(squares, len(ids)), len(ids)))  # the ways to pick those that read wrongly
+        evidence = len(ids) * _evidence_bits(load_dictionary(names[-1])) - by_chance
+        if evidence > best_evidence:
+            best_evidence = evidence
+            best = next(n for n in names if len(load_dictionary(n).bytesList) > max(ids))
+    return best
 
 
 def configured_detector(config: Config, landmark_map: LandmarkMap | None) -> MarkerDetector:
@@ -403,8 +392,7 @@ class TrackingDetector:
             ImageError: the image cannot be decoded.
         """
         found = self.find(decode(event), event.stamp_ns)
-        sightings = tuple(MarkerCorners(i, corners) for i, corners in found)
-        return CornersEvent(event.stamp_ns, event.received_ns, event.topic, event.frame_id, sightings)
+        return CornersEvent.found_in(event, (MarkerCorners(i, corners) for i, corners in found))
 
     def find(self, image: GrayImage, stamp_ns: int) -> Found:
         """Id and corners ``(4, 2)`` of each marker in a gray image, ordered by id, then from the left."""
@@ -544,7 +532,7 @@ class RememberedDetections:
             sightings = self._detector.detect(event).sightings
             if self._note:
                 self._known[key] = self.found[key] = sightings
-        return CornersEvent(event.stamp_ns, event.received_ns, event.topic, event.frame_id, sightings)
+        return CornersEvent.found_in(event, sightings)
 
     def save(self) -> None:
         """Add what was new to the file, if there is one.
@@ -595,22 +583,6 @@ _IMAGES = 5  # looked at, spread over the recording
 _SCANNED = 200
 
 
-def image_hints(recording: Any, detector: MarkerDetector) -> tuple[tuple[str, ...], str | None]:
-    """Hints on why no marker is found, a sentence each: another dictionary, mirrored images, inverted prints.
-
-    Returns:
-        The sentences; and the dictionary, if it is another one.
-    """
-    images = _some_images(recording)
-    hints = list(dict.fromkeys(hint for image in images for hint in detector.diagnose(image)))
-    fitting = None if any(detector.find(image) for image in images) else suggest_dictionary(images)
-    if fitting is None or fitting == detector.dictionary:
-        return tuple(hints), None
-    sentence = f"No marker of {detector.dictionary} is seen, but of {fitting}: set markers.dictionary: {fitting}."
-
-    return (*hints, sentence), fitting
-
-
 def fitting_dictionary(recording: Any) -> str | None:
     """The marker dictionary that fits what is seen in a recording; None if none does."""
     return suggest_dictionary(_some_images(recording))
@@ -618,10 +590,5 @@ def fitting_dictionary(recording: Any) -> str | None:
 
 def _some_images(recording: Any) -> list[GrayImage]:
     events = list(islice((e for e in recording.events() if isinstance(e, ImageEvent)), _SCANNED))
-    images = []
-    for event in events[:: max(1, len(events) // _IMAGES)]:
-        try:
-            images.append(decode(event))
-        except ImageError:
-            continue
-    return images
+    images = map(decoded, events[:: max(1, len(events) // _IMAGES)])
+    return [image for image in images if image is not None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -40,11 +40,8 @@ class ImageEvent(RawEvent):
 
     def decoded_size(self) -> tuple[int, int] | None:
         """Width and height of the decoded image; None if it cannot be decoded."""
-        try:
-            height, width = decode(self).shape
-        except ImageError:
-            return None
-        return width, height
+        image = decoded(self)
+        return None if image is None else (image.shape[1], image.shape[0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +64,11 @@ class CornersEvent(SightingsEvent):
     in_pixels: ClassVar[bool] = True
 
     sightings: tuple[MarkerCorners, ...]
+
+    @classmethod
+    def found_in(cls, image: ImageEvent, sightings: Iterable[MarkerCorners]) -> CornersEvent:
+        """Markers that were found in an image."""
+        return cls(image.stamp_ns, image.received_ns, image.topic, image.frame_id, tuple(sightings))
 
 
 GrayImage = NDArray[np.uint8]
@@ -130,6 +132,14 @@ def decode(event: ImageEvent) -> GrayImage:
     if event.data.size == 0:
         raise ImageError("empty", f"{event.topic}: image without data")
     return _compressed(event) if event.compressed else _raw(event)
+
+
+def decoded(event: ImageEvent) -> GrayImage | None:
+    """Grey levels as `decode` gives them; None if the image cannot be decoded."""
+    try:
+        return decode(event)
+    except ImageError:
+        return None
 
 
 def _compressed(event: ImageEvent) -> GrayImage:

@@ -30,7 +30,7 @@ from fgloc.sensors.checks import FieldChecks, RawChecks, SightingsChecks
 from fgloc.sensors.failures import Change, EventFailure, Scene
 from fgloc.sensors.landmarks import planar_yaw
 from fgloc.sensors.markers.detector import dictionary_names, fitting_dictionary
-from fgloc.sensors.markers.images import CornersEvent, ImageError, ImageEvent, MarkerCorners, decode
+from fgloc.sensors.markers.images import CornersEvent, GrayImage, ImageEvent, MarkerCorners, decoded
 from fgloc.sensors.measurements import LandmarkSighting, PixelMeasurement
 from fgloc.types import Camera, Event, FloatArray, Landmark, RawEvent, SightingsEvent
 
@@ -162,10 +162,8 @@ class MarkersInput(EventInput):
 
 def _first_section(look: FirstLook) -> FirstSection:
     """Dictionary and size, as far as the images show them."""
-    roles = {role.rpartition("/")[2] for role in look.roles}
-    if "image" not in roles:
+    if "image" not in look.kinds:
         return FirstSection()
-
     lines, missing = ["markers:"], []
     asked: list[Asked] = []
     dictionary = fitting_dictionary(look.recording)
@@ -188,7 +186,7 @@ def _first_section(look: FirstLook) -> FirstSection:
         side = Question("Side of the markers' black square [m]", ("markers.default_size_m",), 5.0)
         asked.append(Asked(missing[-1], (side,), replaced=(lines[-1],)))
     lines.append("  sigma_px: 0.1  # of a corner: 0.1 for a sharp camera, 0.3 for one that shakes")
-    if "camera_info" not in roles:
+    if "camera_info" not in look.kinds:
         lines += [
             "",
             "# The recording has no CameraInfo:",
@@ -203,49 +201,40 @@ FIRST_SETTINGS = FirstSettings((), _first_section)
 class Darkness(EventFailure):
     """Images get darker by the factor ``gain`` and noisy by ``noise`` gray levels (standard deviation, of 255)."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (ImageEvent,)
     pixels: ClassVar[bool] = True
     kind: Literal["darkness"] = "darkness"
     gain: float = Field(0.1, ge=0, le=1, description="brightness that is left, as a share")
     noise: float = Field(2.0, ge=0, description="read noise [gray levels of 255]")
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Classes of the changed events: images."""
-        return (ImageEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Return the function that darkens an image, adds noise and rounds."""
-
-        def darken(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-            noise = scene.rng.standard_normal(image.shape, dtype=np.float32) * np.float32(self.noise)
-            return np.clip(np.rint(image * np.float32(self.gain) + noise), 0, 255).astype(np.uint8)
-
-        return _on_pixels(darken)
+    def change(self, event: ImageEvent, scene: Scene) -> Event:
+        """Darken an image, add noise and round."""
+        image = decoded(event)
+        if image is None:
+            return event
+        noise = scene.rng.standard_normal(image.shape, dtype=np.float32) * np.float32(self.noise)
+        return _with_pixels(event, np.clip(np.rint(image * np.float32(self.gain) + noise), 0, 255).astype(np.uint8))
 
 
 class MirroredImage(EventFailure):
     """Images are flipped left to right, as by a wrong setting of the driver."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (ImageEvent,)
     pixels: ClassVar[bool] = True
     kind: Literal["mirrored_image"] = "mirrored_image"
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Classes of the changed events: images."""
-        return (ImageEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Return the function that flips an image."""
-        return _on_pixels(lambda image: image[:, ::-1])
+    def change(self, event: ImageEvent, scene: Scene) -> Event:
+        """Flip an image."""
+        image = decoded(event)
+        return event if image is None else _with_pixels(event, image[:, ::-1])
 
 
 class FrameRate(EventFailure):
     """The camera gives at most ``max_hz`` messages a second; the others are dropped."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (RawEvent, SightingsEvent)  # all that a camera reports
     kind: Literal["frame_rate"] = "frame_rate"
     max_hz: float = Field(1.0, gt=0, description="Hz")
-
-    def targets(self) -> tuple[type[Event], ...]:
-        """Classes of the changed events: everything that a camera reports."""
-        return (RawEvent, SightingsEvent)
 
     def begin(self, scene: Scene) -> Change:
         """Return the function that drops what follows the last message too soon (5 % of jitter is let through)."""
@@ -261,20 +250,10 @@ class FrameRate(EventFailure):
         return change
 
 
-def _on_pixels(work: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Change:
-    """Return the function that changes a decoded image; an image that cannot be decoded stays as it is."""
-
-    def change(event: Event) -> Event | None:
-        assert isinstance(event, ImageEvent)
-        try:
-            gray = work(decode(event))
-        except ImageError:
-            return event
-        height, width = gray.shape
-        pixels = np.ascontiguousarray(gray).reshape(-1)
-        return replace(event, encoding="mono8", compressed=False, width=width, height=height, step=width, data=pixels)
-
-    return change
+def _with_pixels(event: ImageEvent, gray: GrayImage) -> Event:
+    height, width = gray.shape
+    pixels = np.ascontiguousarray(gray).reshape(-1)
+    return replace(event, encoding="mono8", compressed=False, width=width, height=height, step=width, data=pixels)
 
 
 _CLEAR_RATIO = 2.0  # a marker's pose is unambiguous if the mirrored one explains its corners this much worse

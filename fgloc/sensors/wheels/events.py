@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,6 +41,16 @@ class PoseAndTwistEvent(MotionEvent):
     angular: FloatArray  # (3,) rad/s
     twist_cov: FloatArray  # (6, 6)
 
+    @property
+    def pose(self) -> FloatArray:
+        """Planar part ``(3,)`` of the pose."""
+        return np.array([self.position[0], self.position[1], quaternion_yaw(self.orientation)])
+
+    def with_pose(self, pose: FloatArray) -> Self:
+        """Copy with another planar pose ``(3,)``; the height stays."""
+        position = np.array([pose[0], pose[1], self.position[2]])
+        return replace(self, position=position, orientation=yaw_quaternion(float(pose[2])))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryEvent(PoseAndTwistEvent):
@@ -54,8 +64,7 @@ class OdometryEvent(PoseAndTwistEvent):
     @property
     def odometer(self) -> OdometerPose | None:
         """Planar part of the odometry."""
-        pose = np.array([self.position[0], self.position[1], quaternion_yaw(self.orientation)])
-        return OdometerPose(self.frame_id, pose, np.array([*self.linear[:2], self.angular[2]]))
+        return OdometerPose(self.frame_id, self.pose, np.array([*self.linear[:2], self.angular[2]]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,11 +136,6 @@ def from_ackermann(m: Any, when: When) -> Event:
     nan = math.nan
     position, velocity = np.array([m.steering_angle, nan]), np.array([m.steering_angle_velocity, m.speed])
     return JointsEvent(*when, ("steering_angle", "speed"), position, velocity, np.empty(0))
-
-
-def from_ackermann_stamped(m: Any, when: When) -> Event:
-    """Event of an ``ackermann_msgs/AckermannDriveStamped``, likewise."""
-    return from_ackermann(m.drive, when)
 
 
 _MAX_ANGLE = 1e15  # rad or ticks, of a joint: beyond it a double has no whole ticks
@@ -330,6 +334,16 @@ class OdometryChecks:
         return found
 
 
+def planar(pose: Sequence[float] | None, twist: Sequence[float] | None) -> tuple[FloatArray, ...]:
+    """Fields of a `PoseAndTwistEvent` from its position on, by planar pose and twist ``(3,)``; None: it has none."""
+    unknown = np.full(3, np.nan)
+    x, y, yaw = unknown if pose is None else np.asarray(pose, dtype=float)
+    vx, vy, w = unknown if twist is None else np.asarray(twist, dtype=float)
+    orientation = np.full(4, np.nan) if np.isnan(yaw) else yaw_quaternion(float(yaw))
+    pose_cov, twist_cov = (NOT_GIVEN if part is None else np.zeros((6, 6)) for part in (pose, twist))
+    return np.array([x, y, 0.0]), orientation, pose_cov, np.array([vx, vy, 0.0]), np.array([0.0, 0.0, w]), twist_cov
+
+
 class WheelsInput(EventInput):
     """Methods that make the events of wheels: odometry and joint states."""
 
@@ -348,16 +362,7 @@ class WheelsInput(EventInput):
             twist: forward, left [m/s], yaw rate [rad/s] of the base; None: it has none.
             frame_id: of the pose.
         """
-        unknown = np.full(3, np.nan)
-        x, y, yaw = unknown if pose is None else np.asarray(pose, dtype=float)
-        vx, vy, w = unknown if twist is None else np.asarray(twist, dtype=float)
-        position = np.array([x, y, 0.0])
-        orientation = np.full(4, np.nan) if np.isnan(yaw) else yaw_quaternion(float(yaw))
-        linear, angular = np.array([vx, vy, 0.0]), np.array([0.0, 0.0, w])
-        pose_cov, twist_cov = (NOT_GIVEN if part is None else np.zeros((6, 6)) for part in (pose, twist))
-        when = self._when("odometry", stamp_ns)
-        known = (position, orientation, pose_cov, linear, angular, twist_cov)
-        self._deliver(OdometryEvent(*when, frame_id, BASE, *known))
+        self._deliver(OdometryEvent(*self._when("odometry", stamp_ns), frame_id, BASE, *planar(pose, twist)))
 
     def joints(
         self,

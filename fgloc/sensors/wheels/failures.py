@@ -13,8 +13,7 @@ from pydantic import Field
 
 from fgloc import se2
 from fgloc.config import WheelsConfig
-from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.sensors.failures import Carriage, Change, EventFailure, Failure, Scene
+from fgloc.sensors.failures import Carriage, EventFailure, Failure, Scene
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent, PoseAndTwistEvent
 from fgloc.types import Event, FloatArray
 
@@ -172,11 +171,11 @@ class _Odometer:
         self._reported: FloatArray | None = None  # pose as reported; None while it is the recorded one
 
     def rewrite(self, event: OdometryEvent, corrupt: Corrupt) -> OdometryEvent:
-        pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+        pose = event.pose
         before, self._before = self._before, (event.stamp_ns, pose)
         dt = 0.0 if before is None else (event.stamp_ns - before[0]) * 1e-9
         if before is None or dt <= 0.0:
-            return event if self._reported is None else self._with_pose(event, self._reported)
+            return event if self._reported is None else event.with_pose(self._reported)
         twist = np.array([event.linear[0], event.angular[2]])
         corrupted = self._of_wheels(f"{event.topic} rates", twist, dt, corrupt)
         changed = event
@@ -191,7 +190,7 @@ class _Odometer:
             return changed
         start = before[1] if self._reported is None else self._reported
         self._reported = se2.compose(start, se2.exp((reported[0] * dt, moved[1], reported[1] * dt)))
-        return self._with_pose(changed, self._reported)
+        return changed.with_pose(self._reported)
 
     def _of_wheels(self, source: str, rates: FloatArray, dt: float, corrupt: Corrupt) -> FloatArray:
         """Forward speed and yaw rate ``(2,)`` by way of the wheels."""
@@ -203,11 +202,6 @@ class _Odometer:
             return rates
         left, right = left_right
         return np.array([0.5 * (left + right), (right - left) / self._track])
-
-    @staticmethod
-    def _with_pose(event: OdometryEvent, pose: FloatArray) -> OdometryEvent:
-        position = np.array([pose[0], pose[1], event.position[2]])
-        return replace(event, position=position, orientation=yaw_quaternion(float(pose[2])))
 
 
 class _Encoders:
@@ -285,21 +279,13 @@ class EncoderFrozen(Failure):
 class EncoderRollover(EventFailure):
     """Joint angles are counted modulo ``range_rad``: they fall back to 0 when they reach it."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (JointsEvent,)
     kind: Literal["encoder_rollover"] = "encoder_rollover"
     range_rad: float = Field(6.283185307179586, gt=0, description="rad")
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Classes of the changed events: joint states."""
-        return (JointsEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Return the function that wraps the angles."""
-
-        def wrap(event: Event) -> Event:
-            assert isinstance(event, JointsEvent)
-            return replace(event, position=np.mod(event.position, self.range_rad))
-
-        return wrap
+    def change(self, event: JointsEvent, scene: Scene) -> Event:
+        """Wrap the angles."""
+        return replace(event, position=np.mod(event.position, self.range_rad))
 
 
 class OdometryReset(Failure):
@@ -323,50 +309,34 @@ class OdometryReset(Failure):
                 same = len(origin) == len(event.position)
                 yield replace(event, position=event.position - origin) if same else event
                 continue
-            pose = np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
-            x, y, yaw = se2.between(origins.setdefault(key, pose), pose)
-            yield replace(event, position=np.array([x, y, event.position[2]]), orientation=yaw_quaternion(float(yaw)))
+            pose = event.pose
+            yield event.with_pose(se2.between(origins.setdefault(key, pose), pose))
 
 
 class WheelNan(EventFailure):
     """Odometry's pose and twist, joints' angles and rates are not a number."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (OdometryEvent, JointsEvent)
     kind: Literal["wheel_nan"] = "wheel_nan"
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Classes of the changed events: odometry and joint states."""
-        return (OdometryEvent, JointsEvent)
-
-    def begin(self, scene: Scene) -> Change:
-        """Return the function that fills pose and twist, angles and rates with NaN."""
-
-        def corrupt(event: Event) -> Event:
-            pose = ("position", "orientation", "linear", "angular")
-            names = pose if isinstance(event, OdometryEvent) else ("position", "velocity")
-            changes: dict[str, Any] = {name: np.full_like(getattr(event, name), np.nan) for name in names}
-            return replace(event, **changes)
-
-        return corrupt
+    def change(self, event: OdometryEvent | JointsEvent, scene: Scene) -> Event:
+        """Fill pose and twist, angles and rates with NaN."""
+        pose = ("position", "orientation", "linear", "angular")
+        names = pose if isinstance(event, OdometryEvent) else ("position", "velocity")
+        filled: dict[str, Any] = {name: np.full_like(getattr(event, name), np.nan) for name in names}
+        return replace(event, **filled)
 
 
 class WrongCovariance(EventFailure):
     """Odometry's covariances are ``factor`` times what they were: 0 is unknown, a negative one invalid."""
 
+    changes: ClassVar[tuple[type[Event], ...]] = (OdometryEvent,)
     kind: Literal["wrong_covariance"] = "wrong_covariance"
     factor: float = Field(0.01, description="of variances")
 
-    def targets(self) -> tuple[type[Event], ...]:
-        """Classes of the changed events: odometry."""
-        return (OdometryEvent,)
-
-    def begin(self, scene: Scene) -> Change:
-        """Return the function that multiplies the covariances."""
-
-        def scale(event: Event) -> Event:
-            assert isinstance(event, OdometryEvent)
-            return replace(event, pose_cov=event.pose_cov * self.factor, twist_cov=event.twist_cov * self.factor)
-
-        return scale
+    def change(self, event: OdometryEvent, scene: Scene) -> Event:
+        """Multiply the covariances."""
+        return replace(event, pose_cov=event.pose_cov * self.factor, twist_cov=event.twist_cov * self.factor)
 
 
 def carried(carriage: Carriage) -> Callable[[Event], Event]:
@@ -385,38 +355,40 @@ def carried(carriage: Carriage) -> Callable[[Event], Event]:
     return tell
 
 
-class JoinedWheels:
-    """One topic of wheel angles or odometry poses without a jump at the cuts."""
+class _Continued:
+    """One topic of wheel angles or odometry poses, which goes on from other values than those recorded."""
 
     def __init__(self) -> None:
-        self._shift = 0
         self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
         self._last: FloatArray | None = None  # as reported
 
-    def __call__(self, event: Event, shift: int) -> Event:
-        """Event as if nothing had been cut out before it; ``shift`` is the length of what was cut out [ns]."""
-        assert isinstance(event, JointsEvent | PoseAndTwistEvent)
+    def _told(
+        self, event: JointsEvent | PoseAndTwistEvent, expected: FloatArray | None
+    ) -> JointsEvent | PoseAndTwistEvent:
+        """Event with the present offset, or with that by which it has the expected angles or pose; the event: none."""
         angles = isinstance(event, JointsEvent)
-        now = event.position if isinstance(event, JointsEvent) else _pose(event)
-        carried, self._shift = shift != self._shift, shift
-        if carried and self._last is not None and len(self._last) == len(now):
-            self._offset = self._last - now if angles else se2.compose(self._last, se2.inverse(now))
+        now = event.position if isinstance(event, JointsEvent) else event.pose
+        if expected is not None and len(expected) == len(now):
+            self._offset = expected - now if angles else se2.compose(expected, se2.inverse(now))
         if self._offset is not None and len(self._offset) == len(now):
             now = now + self._offset if angles else se2.compose(self._offset, now)
-            event = _told(event, now)
+            event = replace(event, position=now) if isinstance(event, JointsEvent) else event.with_pose(now)
         self._last = now
         return event
 
 
-def _pose(event: PoseAndTwistEvent) -> FloatArray:
-    return np.array([event.position[0], event.position[1], quaternion_yaw(event.orientation)])
+class JoinedWheels(_Continued):
+    """One topic of wheel angles or odometry poses without a jump at the cuts."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._shift = 0
 
-def _told(event: JointsEvent | PoseAndTwistEvent, now: FloatArray) -> JointsEvent | PoseAndTwistEvent:
-    if isinstance(event, JointsEvent):
-        return replace(event, position=now)
-    position = np.array([now[0], now[1], event.position[2]])
-    return replace(event, position=position, orientation=yaw_quaternion(float(now[2])))
+    def __call__(self, event: Event, shift: int) -> Event:
+        """Event as if nothing had been cut out before it; ``shift`` is the length of what was cut out [ns]."""
+        assert isinstance(event, JointsEvent | PoseAndTwistEvent)
+        cut, self._shift = shift != self._shift, shift
+        return self._told(event, self._last if cut else None)
 
 
 def _rate(carriage: Carriage) -> float:
@@ -432,42 +404,27 @@ def _rate(carriage: Carriage) -> float:
     return spin / float(np.mean(radii)) if radii else 0.0
 
 
-class _Held:
+class _Held(_Continued):
     """One topic of wheel angles or odometry: in the air it goes on from its last value, and afterwards from there."""
 
     def __init__(self, rate: float, speed: float) -> None:
+        super().__init__()
         self._rate, self._speed = rate, speed  # rad/s, m/s in the air
-        self._offset: FloatArray | None = None  # added to angles; T_told_recorded of poses
-        self._last: FloatArray | None = None  # as reported
         self._last_ns = 0
 
     def tell(self, event: JointsEvent | PoseAndTwistEvent, lifted: bool) -> JointsEvent | PoseAndTwistEvent:
         """Event as the wheels in the air, or on the floor again, would report it."""
-        angles = isinstance(event, JointsEvent)
-        now = event.position if isinstance(event, JointsEvent) else _pose(event)
         dt = (event.stamp_ns - self._last_ns) * 1e-9
-        if lifted and self._last is not None and len(self._last) == len(now):
-            if angles:
-                self._offset = self._last + self._rate * dt - now
-            else:
-                told = se2.compose(self._last, (self._speed * dt, 0.0, 0.0))
-                self._offset = se2.compose(told, se2.inverse(now))
-        if self._offset is not None and len(self._offset) == len(now):
-            now = now + self._offset if angles else se2.compose(self._offset, now)
-            event = self._told(event, now, lifted)
-        self._last, self._last_ns = now, event.stamp_ns
-        return event
-
-    def _told(
-        self, event: JointsEvent | PoseAndTwistEvent, now: FloatArray, lifted: bool
-    ) -> JointsEvent | PoseAndTwistEvent:
-        if isinstance(event, JointsEvent):
-            if not lifted:
-                return replace(event, position=now)
-            velocity = np.full_like(event.velocity, self._rate)
-            return replace(event, position=now, velocity=velocity, effort=np.zeros_like(event.effort))
-        position = np.array([now[0], now[1], event.position[2]])
-        event = replace(event, position=position, orientation=yaw_quaternion(float(now[2])))
-        if not lifted:
-            return event
-        return replace(event, linear=np.array([self._speed, 0.0, 0.0]), angular=np.zeros(3))
+        expected = None
+        if lifted and self._last is not None:
+            way = (self._speed * dt, 0.0, 0.0)
+            angles = isinstance(event, JointsEvent)
+            expected = self._last + self._rate * dt if angles else se2.compose(self._last, way)
+        told = self._told(event, expected)
+        self._last_ns = event.stamp_ns
+        if not lifted or told is event:
+            return told
+        if isinstance(told, JointsEvent):
+            velocity = np.full_like(told.velocity, self._rate)
+            return replace(told, velocity=velocity, effort=np.zeros_like(told.effort))
+        return replace(told, linear=np.array([self._speed, 0.0, 0.0]), angular=np.zeros(3))

@@ -157,32 +157,6 @@ def _settings(state: InstallationState, config: Config) -> Iterator[Setting]:
         yield from state.setting(f"wheels.{name}", given, now, {f"wheels.{name}": 1.0})
 
 
-def derivatives(m: MotionMeasurement, change: FloatArray | None, config: WheelsConfig) -> dict[str, FloatArray]:
-    """Derivative ``(3,)`` of a motion (right perturbation) by each parameter.
-
-    Args:
-        m: as it is reported.
-        change: ``(3,)`` of the twist over the step: by it a wrong clock shows; None: it is not needed.
-        config: as it was reported with.
-    """
-    rho_x, rho_y, phi = se2.log(m.motion)
-    by_turn = np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])
-    by = {
-        "wheels.radius": np.array([rho_x, rho_y, phi]),
-        "wheels.track": -phi * by_turn,
-        "wheels.yaw_per_m": rho_x * by_turn,
-        "wheels.slowdown": _by_slowdown(m, rho_x, phi, config),
-    }
-    return by if change is None else by | {"wheels.time_offset_s": change, "wheels.delay_s": -change}
-
-
-def _by_slowdown(m: MotionMeasurement, rho_x: float, phi: float, config: WheelsConfig) -> FloatArray:
-    """Derivative ``(3,)`` of a motion by ``slowdown``, which lowers the speed by the reported turning."""
-    seconds = max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3)
-    commanded = abs(phi) / seconds / config.scale_omega
-    return np.array([-commanded * rho_x / max(1.0 - config.slowdown * commanded, _SLOWEST), 0.0, 0.0])
-
-
 INSTALLATION = MotionInstallation(
     _parameters,
     _found_rows,
@@ -360,7 +334,7 @@ class WheelMotion:
         wanted: Container[str] = (),
         rates: tuple[float, FloatArray] | None = None,
     ) -> dict[str, FloatArray]:
-        """Derivatives ``(3,)`` of a step's motion by the parameters of the wheels.
+        """Derivatives ``(3,)`` of a step's motion (right perturbation) by the parameters of the wheels.
 
         Args:
             step: its events.
@@ -368,16 +342,27 @@ class WheelMotion:
             wanted: those of the clock only where they are wanted.
             rates: weight of another source and its yaw rates ``(2,)`` [rad/s] at start and end of the step.
         """
-        change = None
+        config = self._config
+        rho_x, rho_y, phi = se2.log(m.motion)
+        by_turn = np.array([-0.5 * rho_y, 0.5 * rho_x, 1.0])
+        # Slowdown lowers the speed by the reported turning
+        commanded = abs(phi) / max((m.stamp_ns - m.start_ns) * 1e-9, 1e-3) / config.scale_omega
+        slower = -commanded * rho_x / max(1.0 - config.slowdown * commanded, _SLOWEST)
+        by = {
+            "wheels.radius": np.array([rho_x, rho_y, phi]),
+            "wheels.track": -phi * by_turn,
+            "wheels.yaw_per_m": rho_x * by_turn,
+            "wheels.slowdown": np.array([slower, 0.0, 0.0]),
+        }
         if any(name in wanted for name in OF_CLOCK):
             start, end = self.twist(step, step.start_ns), self.twist(step, step.stamp_ns)
             if rates is not None:
                 weight, (first, last) = rates
                 start[2] += weight * (first - start[2])
                 end[2] += weight * (last - end[2])
-            change = end - se2.adjoint(se2.inverse(m.motion)) @ start
-        by = derivatives(m, change, self._config)
-        drive = self._config.drive
+            change = end - se2.adjoint(se2.inverse(m.motion)) @ start  # by it a wrong clock shows
+            by |= {"wheels.time_offset_s": change, "wheels.delay_s": -change}
+        drive = config.drive
         if drive is not None and self._chosen == "ticks":
             names = tuple(drive.states)
             start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns

@@ -37,7 +37,6 @@ from fgloc.sensors.wheels.events import (
     OdometryChecks,
     OdometryEvent,
     from_ackermann,
-    from_ackermann_stamped,
     from_joints,
     joints_validator,
     odometry_converters,
@@ -134,6 +133,11 @@ class WheelGeometry:
     radii_m: tuple[float, float]
     track_m: float
     by_commands: bool = False
+
+
+def joint_names(joints: Sequence[JointsEvent]) -> tuple[str, ...]:
+    """Names of the joints in the first messages, in their order."""
+    return tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
 
 
 def wheel_pair(names: Sequence[str]) -> WheelPair | None:
@@ -244,14 +248,10 @@ def _commanded(times: FloatArray, difference: FloatArray, commands: Sequence[Con
 def settings_of(events: Sequence[Event]) -> dict[str, Any] | None:
     """Keys of the section `wheels` with which the angles of the wheels are used; None: they are not determined."""
     joints = [event for event in events if isinstance(event, JointsEvent)]
-    names = tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
-    pair = wheel_pair(names)
+    pair = wheel_pair(joint_names(joints))
     odometry = [event for event in events if isinstance(event, OdometryEvent)]
-    found = (
-        None
-        if pair is None
-        else fit_geometry(pair, joints, odometry, [e for e in events if isinstance(e, ControlEvent)])
-    )
+    commands = [event for event in events if isinstance(event, ControlEvent)]
+    found = None if pair is None else fit_geometry(pair, joints, odometry, commands)
     if pair is None or found is None:
         return None
     left, right = (float(f"{radius:.4g}") for radius in found.radii_m)
@@ -293,13 +293,11 @@ def _slope(x: FloatArray, y: FloatArray) -> float | None:
 
 def _first_section(look: FirstLook) -> FirstSection:
     """Joints, radii and track, as far as the recording shows them."""
-    joints = [event for event in look.events[JointsEvent] if isinstance(event, JointsEvent)]
-    odometry = [event for event in look.events[OdometryEvent] if isinstance(event, OdometryEvent)]
-    names = tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
+    joints, odometry, commands = look.of(JointsEvent), look.of(OdometryEvent), look.of(ControlEvent)
+    names = joint_names(joints)
     if not names:
         return FirstSection()
     pair = wheel_pair(names)
-    commands = [event for event in look.events[ControlEvent] if isinstance(event, ControlEvent)]
     geometry = None if pair is None or not odometry else fit_geometry(pair, joints, odometry, commands)
     head = f"# Joints in the recording: {', '.join(names)}."
     if pair is not None and geometry is not None:
@@ -537,7 +535,7 @@ def _units(joints: Sequence[JointsEvent], config: Config) -> list[RawMistake]:
     """Mistakes of joints that are the motion of the wheels: no geometry is given, or they are in another unit."""
     wheels, bound = config.wheels, config.gate.max_wheel_rate
     turning = [e for e in joints if len(e.position) == len(e.names)]
-    names = tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
+    names = joint_names(joints)
     pair = wheel_pair(names) or WheelPair("", "")
     sides = (wheels.left_joint or pair.left, wheels.right_joint or pair.right)
     own = wheels.drive.driven if wheels.drive is not None else sides if all(sides) else names
@@ -689,7 +687,7 @@ WHEELS = BuiltIn(
             {
                 "sensor_msgs/msg/JointState": from_joints,
                 "ackermann_msgs/msg/AckermannDrive": from_ackermann,
-                "ackermann_msgs/msg/AckermannDriveStamped": from_ackermann_stamped,
+                "ackermann_msgs/msg/AckermannDriveStamped": lambda m, when: from_ackermann(m.drive, when),
             },
             ("joint_states",),
             validator=joints_validator,
