@@ -15,6 +15,7 @@ from fgloc.diagnosis.handling import Handling
 from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.pairs import Figure, RateFit, fit_rate
 from fgloc.diagnosis.signals import Path, Signals, turn_by
+from fgloc.drives.steered import Ackermann, Tricycle
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.sensor import right_sides
 from fgloc.types import Finding, FloatArray, LandmarkMap, Severity
@@ -112,6 +113,12 @@ class Conventions:
     def right_sides(self, kind: str = "exchanged") -> dict[str, Any]:
         """Lines that undo a mistake of `WRONG_SIDES`; empty: joints have no names, or no radii."""
         return {f"wheels.{key}": value for key, value in right_sides(kind, self.config.wheels).items()}
+
+    @property
+    def steered(self) -> Ackermann | Tricycle | None:
+        """The drive, if it has a steered axle."""
+        drive = self.config.wheels.drive
+        return drive if isinstance(drive, Ackermann | Tricycle) else None
 
     @property
     def wheel_units(self) -> Mapping[float, str]:

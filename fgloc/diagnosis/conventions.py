@@ -18,6 +18,7 @@ from fgloc.diagnosis.landmark_fits import Mounting, fit_sightings
 from fgloc.diagnosis.pairs import LAG_SIGMAS, LATE_S, TELLS, Figure, RateFit, fit_rate, varied, weighted
 from fgloc.diagnosis.ranges import check_ranges
 from fgloc.diagnosis.signals import Path, Signals, turn_by
+from fgloc.diagnosis.steering import check_steering
 from fgloc.diagnosis.truth import BodyFit
 from fgloc.types import FloatArray, LandmarkMap, Severity
 
@@ -42,6 +43,7 @@ def conventions(
         if (rates := signals.rates()) is not None:
             gyro.check_gravity(found, rates[2], found.up)
         return found
+    path = check_steering(found, path)
     found.commanded = path.source == "command"
     odometry.check_sideways(found, path)
     path = odometry.check_angles(found, path)

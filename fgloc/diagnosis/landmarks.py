@@ -74,8 +74,8 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
     """Name which of wheels and gyro turns the wrong way, by the landmarks; whether it is the wheels."""
     if seen is None:
         if not found.signals.images:  # what images show is compared elsewhere
-            text = "Wheels and gyro turn in opposite directions: left and right are exchanged, or the gyro's sign"
-            found.add("yaw.sign", text)
+            wrong = "the steering's sign is wrong" if found.steered else "left and right are exchanged"
+            found.add("yaw.sign", f"Wheels and gyro turn in opposite directions: {wrong}, or the gyro's sign")
         return False
     mirrored = Path(path.times, path.poses * [1.0, -1.0, -1.0], path.gaps)
     turned = Sightings(seen.times, seen.ids, seen.points @ _place(found)[:3, :3].T, seen.spatial)
@@ -85,7 +85,9 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
     wheels = found.config.wheels
     if misfits[1] * _WORSE < misfits[0]:
         lines: dict[str, Any] = {"wheels.scale_omega": -wheels.scale_omega}
-        if wheels.track is not None:
+        if (drive := found.steered) is not None:
+            lines = {"wheels.drive.steering_ratio": -drive.steering_ratio}
+        elif wheels.track is not None:
             lines = found.right_sides() or lines
         backwards = found.right_sides("reversed") if path.source == "ticks" else {}
         if backwards and looks_back:
