@@ -406,6 +406,9 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
         yield f"  base_frame: {seen.frames[0]}"
     else:
         yield "  # base_frame: base_link  # no usual name is in tf"
+    if "frame.unmounted" in {finding.code for finding in seen.info.found}:
+        yield "  # Where the sensor is on the base, which tf does not have: x y z [m] forward, left, up; roll pitch yaw [rad]."
+        yield "  # sightings_pose: [0.1, 0.0, 0.3, 0.0, 0.0, 0.0]  # looks ahead"
     timing = {role: t for t in seen.info.topics for role, topic in seen.info.roles.items() if topic == t.name}
     unstamped = {role for role, t in timing.items() if 2 * t.zero_stamps > t.count}
     other = unstamped.union(other_clocks({role: t.delay_s or 0.0 for role, t in timing.items()}))  # without stamps: 0
