@@ -105,7 +105,7 @@ def test_a_sensor_without_noise_still_has_what_wheels_err_by(distance, least):
     known = LandmarkMap({1: Landmark(1, np.array([1.0, 0.0, 0.0]), np.eye(3), 0.0)})
     collector = SightingCollector(config, known, LandmarkSensor(config, known, None, None), np.eye(4))
     event = RangeBearingEvent(1, 1, "/landmarks", "base_link", (RangeBearing(1, distance, 0.3),))
-    (seen,) = collector.sightings(event, 0.0)
+    (seen,) = collector.sightings(event)
     assert np.linalg.norm(seen.point) == pytest.approx(distance)
     assert least <= seen.sigma_m < 2.0 * least
     assert 0.01 <= seen.sigma_rad < 0.02
