@@ -25,7 +25,7 @@ X, Y = (np.concatenate([[0.0], np.cumsum(0.02 * SPEED * f(YAW))[:-1]]) for f in 
 _AROUND = np.linspace(0.0, math.tau, 9)[:-1]
 BEACONS = np.column_stack([X.mean() + 3.0 * np.cos(_AROUND) + 0.3 * _AROUND, Y.mean() + 2.5 * np.sin(_AROUND)])
 ONE, NONE = Figure(1.0, 0.001), Figure(0.0, 0.001)
-MOUNTING = Mounting("body", ONE, NONE, NONE, NONE, NONE, ONE, 0.05, 500)
+MOUNTING = Mounting("body", ONE, NONE, NONE, NONE, NONE, ONE, 0.05)
 
 
 def path_of(x=X, y=Y, yaw=YAW) -> Path:
