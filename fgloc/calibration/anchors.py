@@ -188,19 +188,18 @@ def _locate(tags: FloatArray, ranges: FloatArray, config: UwbConfig) -> _Place |
     def mirrored(x: FloatArray) -> complex:
         return middle + axis * ((complex(*x[:2]) - middle) / axis).conjugate()
 
+    def cost(x: FloatArray) -> float:
+        return float((residuals(x, sigma) ** 2).sum())
+
     for _ in range(2):
         sigma = misfit(best)
         tried = [solved(complex(*x[:2]), sigma) for x in tried] + [solved(mirrored(best), sigma)]
-        cost = {id(x): float((residuals(x, sigma) ** 2).sum()) for x in tried}
-        best = min(tried, key=lambda x: cost[id(x)])
+        best = min(tried, key=cost)
     rivals = [x for x in tried if math.dist(x[:2], best[:2]) > _APART * sigma]
-    if rivals:
-        rival = min(rivals, key=lambda x: cost[id(x)])
-        if cost[id(rival)] - cost[id(best)] < max(_DECIDED, _DECIDED_EACH * len(ranges)):
-            places = " and ".join(f"({x[0]:.1f}, {x[1]:.1f})" for x in (best, rival))
-            return (
-                f"two places explain its ranges alike, {places} m: mirror images about a straight path. Drive a curve"
-            )
+    rival = min(rivals, key=cost, default=None)
+    if rival is not None and cost(rival) - cost(best) < max(_DECIDED, _DECIDED_EACH * len(ranges)):
+        places = " and ".join(f"({x[0]:.1f}, {x[1]:.1f})" for x in (best, rival))
+        return f"two places explain its ranges alike, {places} m: mirror images about a straight path. Drive a curve"
     J = least_squares(residuals, best, method="lm", args=(sigma,)).jac
     vague = float(np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(best))))[:2].max()))
     if vague > _VAGUE_M:
@@ -264,7 +263,8 @@ class _Graph:
                 for m in sensor.measure(event):
                     moved = m.compensated(se2.between(pose, then), np.zeros((3, 3)))
                     place = places.get(event.anchor)
-                    fits = place is None or abs(self._off(m, then, place)) < _FITS * place.misfit
+                    off = 0.0 if place is None else abs(m.by_constants(then, place.x[3:])[0][0])
+                    fits = place is None or off < _FITS * place.misfit
                     (kept if fits else later).append(moved)
             others = [s.measurement for s in frame.sightings if not isinstance(s.measurement, UwbRange)]
             origin = _ORIGIN if n == 0 and not parts.sensors else _FREE
@@ -303,10 +303,6 @@ class _Graph:
         blocks = (cov[k : k + 3, k : k + 3] for k in range(0, len(rows), 3))
         made = zip(anchors, positions, blocks, strict=True)
         return {i: Landmark(i, position, np.eye(3), 0.0, 0.5 * (own + own.T)) for i, position, own in made}
-
-    @staticmethod
-    def _off(m: UwbRange, pose: FloatArray, place: _Place) -> float:
-        return float(m.by_constants(pose, place.x[3:])[0][0])
 
 
 def _apart(positions: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ import numpy as np
 from fgloc.assembly import Assembly
 from fgloc.config import CAMERA_ROLES, Config, camera_role, one_line, setting
 from fgloc.frames import rotation_of, sensor_pose
-from fgloc.graph.contradictions import Contradiction, Rival
+from fgloc.graph.contradictions import Contradiction
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate, camera_block
 from fgloc.sensors import odometry, registry
 from fgloc.sensors.base import InstallationState
@@ -33,6 +33,7 @@ Found = Mapping[str, tuple[float, float]]
 
 _Row = tuple[str, str, float, float]  # name, parameter of the installation, value at 0, change by the parameter
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_OF_SIGHTINGS = {"range_scale": 1.0, "bearing_offset_rad": 0.0, "time_offset_s": 0.0, "x_m": 0.0, "y_m": 0.0}  # at 0
 
 
 def found_values(
@@ -55,15 +56,17 @@ def found_values(
     """
     motion = [row for made in registry.MOTION_INSTALLATIONS for row in made.found(config)]
     sensed = [(row.name, row.parameter, row.at, row.gain) for row in registry.found_rows(config)]
-    out = _values([*motion, *sensed, *_sighting_rows()], installation, belief)
+    sightings = [(f"sightings.{name}", f"sightings.{name}", at, 1.0) for name, at in _OF_SIGHTINGS.items()]
+    out = _values([*motion, *sensed, *sightings], installation, belief)
     for camera in cameras:
         if (block := camera_block(camera.name)) in installation.blocks:
             first = installation.blocks[block][0]
-            out |= mounting(camera, belief.mean[first : first + 6], belief.cov[first : first + 6, first : first + 6])
+            place = slice(first, first + 6)
+            out |= mounting(camera, belief.mean[place], belief.cov[place, place])
             out |= _values(_lens_rows(camera), installation, belief)
     for i in installation.landmarks if landmark_map is not None else ():
-        place = landmark_map.landmarks[i].position.tolist()  # type: ignore[union-attr]
-        rows = [(f"map.{i}.{axis}", f"map.{i}.{axis}_m", at, 1.0) for axis, at in zip("xyz", place, strict=True)]
+        at = landmark_map.landmarks[i].position.tolist()  # type: ignore[union-attr]
+        rows = [(f"map.{i}.{axis}", f"map.{i}.{axis}_m", value, 1.0) for axis, value in zip("xyz", at, strict=True)]
         out |= _values(rows, installation, belief)
     return out
 
@@ -79,16 +82,6 @@ def _values(
             i = installation.index[parameter]
             out[name] = (at + gain * float(belief.mean[i]), abs(gain) * float(sigma[i]))
     return out
-
-
-def _sighting_rows() -> list[_Row]:
-    return [
-        ("sightings.range_scale", "sightings.range_scale", 1.0, 1.0),
-        ("sightings.bearing_offset_rad", "sightings.bearing_offset_rad", 0.0, 1.0),
-        ("sightings.time_offset_s", "sightings.time_offset_s", 0.0, 1.0),
-        ("sightings.x_m", "sightings.x_m", 0.0, 1.0),
-        ("sightings.y_m", "sightings.y_m", 0.0, 1.0),
-    ]
 
 
 def _lens_rows(camera: Camera) -> list[_Row]:
@@ -170,9 +163,9 @@ def settings_found(found: InstallationFound, config: Config) -> tuple[Setting, .
         config: as the run used it.
     """
     state = InstallationState(found)
-    motion, sightings = _of_motion(state, config), _of_sightings(state, config)
+    motion = (s for made in registry.MOTION_INSTALLATIONS for s in made.settings(state, config))
     of_cameras = (s for camera in found.cameras for s in _of_camera(state, config, camera))
-    return (*motion, *sightings, *of_cameras, *_clocks(state, config, found))
+    return (*motion, *_of_sightings(state, config), *of_cameras, *_clocks(state, config, found))
 
 
 def constants_found(found: InstallationFound, config: Config) -> Iterator[Setting]:
@@ -189,11 +182,6 @@ def constants_found(found: InstallationFound, config: Config) -> Iterator[Settin
         )
 
 
-def _of_motion(state: InstallationState, config: Config) -> Iterator[Setting]:
-    for installation in registry.MOTION_INSTALLATIONS:
-        yield from installation.settings(state, config)
-
-
 def _of_sightings(state: InstallationState, config: Config) -> Iterator[Setting]:
     scale, bias = config.landmarks.range_scale, config.landmarks.bearing_bias_rad
     found = scale * math.exp(min(state.value("sightings.range_scale"), _MOST_LOG_SCALE))
@@ -206,7 +194,8 @@ def _of_camera(state: InstallationState, config: Config, camera: Camera) -> Iter
     block = camera_block(camera.name)
     if f"{block}.x_m" not in state.index:
         return
-    place = slice(state.index[f"{block}.x_m"], state.index[f"{block}.x_m"] + 6)
+    first = state.index[f"{block}.x_m"]
+    place = slice(first, first + 6)
     at_first = mounting(camera, np.zeros(6), state.prior[place, place])
     now = mounting(camera, state.mean[place], state.cov[place, place])
     for axis in _AXES:
@@ -423,7 +412,7 @@ def contradiction_findings(
         return [Finding(CODES[0], f"{text}{_NOT_COMPARED}", Severity.ERROR)]
     if not rivals:
         return [Finding(CODES[0], f"{text}{_UNEXPLAINED}", Severity.ERROR)]
-    options = [_told(found, rival, config) for rival in rivals]
+    options = [_settings(found, rival.names, config, rival.mean, rival.sigmas) for rival in rivals]
     lines = _lines(options[0]) if len(rivals) == 1 and rivals[0].sensible else {}
     said = [[f"{s.name} {_number(s)}" for s in option] for option in options]
     shown = " or ".join(" with ".join(own or rival.names) for own, rival in zip(said, rivals, strict=True))
@@ -437,10 +426,6 @@ def contradiction_findings(
         )
     value = (options[0][0].found, options[0][0].sigma) if len(rivals) == 1 and options[0] else (None, None)
     return [Finding(CODES[0], told, Severity.ERROR, lines, *value)]
-
-
-def _told(found: InstallationFound, rival: Rival, config: Config) -> list[Setting]:
-    return _settings(found, rival.names, config, rival.mean, rival.sigmas)
 
 
 def _settings(

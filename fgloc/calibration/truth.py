@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -164,6 +165,24 @@ def _windows(times: FloatArray, origin_ns: int, motion: IntArray) -> Iterator[tu
             start = end
 
 
+class _Part(NamedTuple):
+    """One window.
+
+    Attributes:
+        seen: displacement ``(3,)`` of the tracked body by the truth.
+        cov: ``(3, 3)`` of the wheels' noise, in the body's axes.
+        linked: whether it begins where the one before ends: they share a pose of the truth.
+    """
+
+    seen: FloatArray
+    cov: FloatArray
+    linked: bool
+
+
+_Rows = tuple[FloatArray, FloatArray, list[_Part]]
+"""Residuals ``(3 K,)``, their derivatives ``(3 K, p)``, and the windows."""
+
+
 class _Fit:
     """State of the fit: settings of the wheels, place of the body, clock, and noise."""
 
@@ -193,7 +212,7 @@ class _Fit:
             if round_ < _ROUNDS - 1:
                 self._find_noise(residuals, parts)
                 self._weigh(residuals, parts)
-        way = np.array([np.hypot(*d[:2]) + abs(d[2]) for d, _, _ in parts])
+        way = np.array([np.hypot(*part.seen[:2]) + abs(part.seen[2]) for part in parts])
         misfit = np.abs(residuals.reshape(-1, 3)).sum(axis=1)
         moved = way > 0.2 * np.max(way)
         if float(np.median(misfit[moved] / way[moved])) > _FOLLOWS:
@@ -216,25 +235,23 @@ class _Fit:
     def settings(self) -> tuple[Setting, ...]:
         """Rows of the table of `fgloc calibrate`: each setting as it was given and as it was found."""
         n = len(self._names)
-        prior = np.diag(self._prior[:n] ** 2)
-        state = InstallationState(
-            InstallationFound(tuple(self._names), np.zeros(n), self._cov[:n, :n], prior, (), "", "joints")
-        )
-        given = InstallationState(InstallationFound(tuple(self._names), np.zeros(n), prior, prior, (), "", "joints"))
-        before = {s.name: s.given for s in INSTALLATION.settings(given, self._given)}
-        made = [
-            Setting(s.name, before[s.name], s.found, s.sigma, s.prior_sigma)
-            for s in INSTALLATION.settings(state, self.config)
-        ]
+        before = {s.name: s.given for s in self._settings(self._given, np.zeros(n))}
+        made = [replace(s, given=before[s.name]) for s in self._settings(self.config, np.zeros(n))]
         sigma = np.sqrt(np.diag(self._cov))[n:]
         at = [*self._given.truth.offset_m, self._given.truth.yaw_offset_rad, 0.0]
         now = [*self._body.tolist(), self._late_s]
         made += [Setting(*row) for row in zip(OF_BODY, at, now, sigma.tolist(), self._prior[n:].tolist(), strict=True)]
         return tuple(made)
 
-    def _covariance(
-        self, residuals: FloatArray, jacobian: FloatArray, parts: Sequence[tuple[FloatArray, FloatArray, bool]]
-    ) -> FloatArray:
+    def _settings(self, config: Config, mean: FloatArray) -> Iterator[Setting]:
+        """Settings of the wheels in a configuration, with its constants changed by so much ``(n,)``."""
+        n = len(self._names)
+        found = InstallationFound(
+            tuple(self._names), mean, self._cov[:n, :n], np.diag(self._prior[:n] ** 2), (), "", "joints"
+        )
+        return INSTALLATION.settings(InstallationState(found), config)
+
+    def _covariance(self, residuals: FloatArray, jacobian: FloatArray, parts: Sequence[_Part]) -> FloatArray:
         """Covariance of the parameters, no smaller than what blocks of windows differ by.
 
         Wheels that slip, or lose ticks, are off for longer than a window. Source: White 1980, "A
@@ -277,10 +294,7 @@ class _Fit:
 
     def _move(self, step: FloatArray) -> None:
         n = len(self._names)
-        state = InstallationState(
-            InstallationFound(tuple(self._names), step[:n], np.eye(n), np.eye(n), (), "", "joints")
-        )
-        values = {s.name.removeprefix("wheels."): s.found for s in INSTALLATION.settings(state, self.config)}
+        values = {s.name.removeprefix("wheels."): s.found for s in self._settings(self.config, step[:n])}
         try:
             self.config = with_wheels(self.config, values)
         except ValueError:  # no such geometry: a shorter step is tried
@@ -289,8 +303,8 @@ class _Fit:
         self._body = se2.compose(self._body, se2.exp(step[n : n + 3])) if np.isfinite(step).all() else self._body
         self._late_s += float(step[n + 3])
 
-    def _rows(self) -> tuple[FloatArray, FloatArray, list[tuple[FloatArray, FloatArray, bool]]]:
-        """Residuals ``(3 K,)``, their derivatives ``(3 K, p)``, and of each window: displacement, noise, link."""
+    def _rows(self) -> _Rows:
+        """All windows under the settings as they are now."""
         residuals, jacobian, parts = [], [], []
         to_body = se2.adjoint(se2.inverse(self._body))
         for recorded in self._recorded:
@@ -313,47 +327,44 @@ class _Fit:
                 J[:, n + 3] = se2.log(se2.between(before, after)) / (2.0 * _SHIFT_S)
                 residuals.append(residual)
                 jacobian.append(J)
-                parts.append((seen, to_body @ m.cov @ to_body.T, linked))
+                parts.append(_Part(seen, to_body @ m.cov @ to_body.T, linked))
         return np.concatenate(residuals), np.vstack(jacobian), parts
 
-    def _banded(self, parts: Sequence[tuple[FloatArray, FloatArray, bool]], logs: FloatArray) -> FloatArray:
-        """Lower band ``(6, 3 K)`` of the covariance of all residuals."""
+    def _blocks(self, parts: Sequence[_Part], logs: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Covariance ``(3, 3)`` of each window's residual, and that with the window before if they share a pose."""
         of_way, of_yaw, place, yaw = np.exp(logs)
         scale = np.outer(*[np.array([of_way, of_way, of_yaw])] * 2)
         R = np.diag(np.square([_TRUTH_M * place, _TRUTH_M * place, _TRUTH_RAD * yaw]))
+        for part, weight in zip(parts, self._weights, strict=False):
+            back = se2.adjoint(se2.inverse(part.seen))
+            yield part.cov * scale / weight + R + back @ R @ back.T, -back @ R * part.linked
+
+    def _factor(self, parts: Sequence[_Part], logs: FloatArray) -> FloatArray:
+        """Lower band ``(6, 3 K)`` of the Cholesky factor of the covariance of all residuals."""
         band = np.zeros((6, 3 * len(parts)))
-        for k, (seen, cov, linked) in enumerate(parts):
-            back = se2.adjoint(se2.inverse(seen))
-            whole = cov * scale / self._weights[k] + R + back @ R @ back.T
-            for i in range(3):
-                for j in range(i + 1):
-                    band[i - j, 3 * k + j] = whole[i, j]
-            if linked:
-                cross = -back @ R  # of this window with the one before: they share a pose of the truth
-                for i in range(3):
-                    for j in range(3):
-                        band[3 + i - j, 3 * (k - 1) + j] = cross[i, j]
-        return band
+        for k, (own, cross) in enumerate(self._blocks(parts, logs)):
+            for j in range(3):
+                band[: 3 - j, 3 * k + j] = own[j:, j]
+                if k:
+                    band[3 - j : 6 - j, 3 * (k - 1) + j] = cross[:, j]
+        return np.asarray(cholesky_banded(band, lower=True))
 
-    def _solved(
-        self, columns: FloatArray, parts: Sequence[tuple[FloatArray, FloatArray, bool]], logs: FloatArray | None = None
-    ) -> FloatArray:
+    def _solved(self, columns: FloatArray, parts: Sequence[_Part]) -> FloatArray:
         """Inverse covariance of the residuals times columns ``(3 K, m)``."""
-        factor = cholesky_banded(self._banded(parts, self._logs if logs is None else logs), lower=True)
-        return np.asarray(cho_solve_banded((factor, True), columns))
+        return np.asarray(cho_solve_banded((self._factor(parts, self._logs), True), columns))
 
-    def _cost(self, rows: tuple[FloatArray, FloatArray, list[tuple[FloatArray, FloatArray, bool]]]) -> float:
+    def _cost(self, rows: _Rows) -> float:
         residuals, _, parts = rows
         if not np.isfinite(residuals).all() or not np.isfinite(self._off).all():
             return math.inf
         return float(residuals @ self._solved(residuals, parts) + np.sum((self._off / self._prior) ** 2))
 
-    def _find_noise(self, residuals: FloatArray, parts: Sequence[tuple[FloatArray, FloatArray, bool]]) -> None:
+    def _find_noise(self, residuals: FloatArray, parts: Sequence[_Part]) -> None:
         """Set the noise under which the residuals are most likely."""
         spread = np.array([1.0, 1.0, 2.0, 2.0]) * _LOG_PRIOR
 
         def cost(logs: FloatArray) -> float:
-            factor = cholesky_banded(self._banded(parts, logs), lower=True)
+            factor = self._factor(parts, logs)
             squares = float(residuals @ cho_solve_banded((factor, True), residuals))
             return 0.5 * (squares + float(np.sum((logs / spread) ** 2))) + float(np.log(factor[0]).sum())
 
@@ -368,10 +379,10 @@ class _Fit:
         )
         self._logs = best.x
 
-    def _weigh(self, residuals: FloatArray, parts: Sequence[tuple[FloatArray, FloatArray, bool]]) -> None:
+    def _weigh(self, residuals: FloatArray, parts: Sequence[_Part]) -> None:
         """Weights of the windows by Cauchy's kernel, each by its own covariance."""
         self._weights = np.ones(len(parts))
-        band = self._banded(parts, self._logs)
-        for k, r in enumerate(residuals.reshape(-1, 3)):
-            cov = np.array([[band[abs(i - j), 3 * k + min(i, j)] for j in range(3)] for i in range(3)])
-            self._weights[k] = 1.0 / (1.0 + float(r @ np.linalg.solve(cov, r)) / 3.0 / _CAUCHY_2)
+        covs = np.array([cov for cov, _ in self._blocks(parts, self._logs)])
+        residuals = residuals.reshape(-1, 3, 1)
+        squares = (residuals * np.linalg.solve(covs, residuals)).sum(axis=(1, 2))
+        self._weights = 1.0 / (1.0 + squares / 3.0 / _CAUCHY_2)

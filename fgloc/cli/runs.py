@@ -422,7 +422,7 @@ def evaluate(
         rows.append(("scale, Sim(3)", f"{size.scale:.6f}"))
     say_table(None, rows)
     if size is not None and size.told:
-        say_remark("warning", size.sentence)
+        say_remark("warning", size.finding.text)
 
 
 def compare(

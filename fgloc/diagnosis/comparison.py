@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import Config, Role, WheelsConfig, one_line, setting, with_value
-from fgloc.diagnosis.handling import Handling
 from fgloc.diagnosis.landmark_fits import Noise
 from fgloc.diagnosis.pairs import Figure, RateFit, fit_rate
 from fgloc.diagnosis.signals import Path, Signals, turn_by
@@ -40,8 +39,12 @@ def unit_of(scale: float, within: float = _UNIT, speeds: bool = True) -> tuple[f
     """
     known = {factor: name for factor, name in _UNITS.items() if speeds or "/" not in name}
     units = known | {1.0 / factor: f"metres for {name}" for factor, name in known.items()}
-    factor = min(units, key=lambda unit: abs(math.log(abs(scale) / unit)))
-    return (factor, units[factor]) if abs(math.log(abs(scale) / factor)) < within else None
+    return _nearest(units, abs(scale), within)
+
+
+def _nearest(units: Mapping[float, str], scale: float, within: float) -> tuple[float, str] | None:
+    factor = min(units, key=lambda unit: abs(math.log(scale / unit)))
+    return (factor, units[factor]) if abs(math.log(scale / factor)) < within else None
 
 
 @dataclass
@@ -55,9 +58,7 @@ class Conventions:
         imu_up: ``(3,)`` the base's z axis in the IMU's frame, as configured; None: z.
         landmark_map: None: nothing is compared with a map.
         findings: with the lines that undo them.
-        compared: sentences on the pairs that were compared and agree, for `init`'s comments.
         noise: of the sensor of landmarks, where its axes are right; no finding, but a better start than the defaults.
-        handling: when a person had the robot in hand; nothing is compared there.
         opposite: whether wheels and gyro turn in opposite directions, and gravity does not tell which is wrong.
         commanded: whether commands stand in for wheels.
         wheels: with which the wheels' path was read; what is found since then is not in it.
@@ -70,9 +71,7 @@ class Conventions:
     imu_up: FloatArray | None = None
     landmark_map: LandmarkMap | None = None
     findings: list[Finding] = field(default_factory=list)
-    compared: list[str] = field(default_factory=list)
     noise: Noise | None = None
-    handling: Handling = field(default_factory=Handling)
     opposite: bool = False
     commanded: bool = False
     wheels: WheelsConfig = field(default_factory=WheelsConfig)
@@ -136,9 +135,7 @@ class Conventions:
         """
         if path.source != "ticks" or not self.config.wheels.in_radians or scale <= 0.0:
             return None
-        units = self.wheel_units
-        factor = min(units, key=lambda unit: abs(math.log(scale / unit)))
-        return (factor, units[factor]) if abs(math.log(scale / factor)) < within else None
+        return _nearest(self.wheel_units, scale, within)
 
     def wheels_off_by(self, path: Path, scale: float) -> tuple[float, str, str] | None:
         """Factor, code and clause of what scales way and turn of the wheels alike; None: nothing does by so much.
@@ -165,11 +162,13 @@ class Conventions:
         ]
         fast = rates and float(np.quantile(rates, 1.0 - _BEYOND)) > bound  # by a bound in radians they would be refused
         lines = {"gate.max_wheel_rate": float(f"{bound / factor:.4g}")} if fast else {}
-        if wheels.drive is None and wheels.left_radius and wheels.right_radius:
-            radii = {"left_radius": wheels.left_radius, "right_radius": wheels.right_radius}
-            return lines | {f"wheels.{key}": float(f"{value * factor:.6g}") for key, value in radii.items()}
-        scales = {"scale_v": wheels.scale_v, "scale_omega": wheels.scale_omega}
-        return lines | {f"wheels.{key}": float(f"{value * factor:.6g}") for key, value in scales.items()}
+        by_radii = wheels.drive is None and wheels.left_radius and wheels.right_radius
+        keys = ("left_radius", "right_radius") if by_radii else ("scale_v", "scale_omega")
+        return lines | {f"wheels.{key}": float(f"{getattr(wheels, key) * factor:.6g}") for key in keys}
+
+    def read_again(self, path: Path) -> Path:
+        """Motion by the wheels with what was found of them; the path given where there is none."""
+        return self.signals.path(self.config) or path
 
     def path_with(self, lines: Mapping[str, Any]) -> Path | None:
         """Motion by wheels with other settings; None: no wheels are like this."""
@@ -183,7 +182,7 @@ class Conventions:
 
     def trial(self) -> Conventions:
         """A comparison of the same signals whose findings do not count yet."""
-        return replace(self, findings=[], compared=[])
+        return replace(self, findings=[])
 
     def add(
         self,

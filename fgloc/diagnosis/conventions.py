@@ -62,11 +62,11 @@ def conventions(
     seen = found.signals.sightings()
     undecided = found.opposite and not landmarks.which_is_opposite(found, path, seen)
     if found.opposite and not undecided:
-        path, found.wheels = found.signals.path(found.config) or path, found.config.wheels
+        path, found.wheels = found.read_again(path), found.config.wheels
     by_gyro, turn_sigma = landmarks.turn_of(path, turn)
     sensor = None if seen is None else landmarks.check_sensor(found, by_gyro, seen, turn_sigma)
     if found.config.wheels != found.wheels:
-        path, found.wheels = found.signals.path(found.config) or path, found.config.wheels
+        path, found.wheels = found.read_again(path), found.config.wheels
     landmarks.check_map_unit(found, path, seen)
     drifting = _drifts(found, path)
     undecided &= "imu.sign" not in found.codes
@@ -146,8 +146,6 @@ def _clocks(
     if _surely_late(mean) and all(_alike(lag, mean) for lag in perhaps.values()):
         off = perhaps  # two that are late alike are surer than each
     sensors = [role for role in late if role != "truth"]
-    if not off.keys() & set(sensors):
-        found.compared += [f"{r}: {late[r].value:+.3f} ± {late[r].sigma:.3f} s late" for r in sensors]
     if not off:
         return 0.0
     of_all = weighted(list(off.values()))

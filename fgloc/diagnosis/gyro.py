@@ -51,7 +51,6 @@ def by_hand(found: Conventions, path: Path) -> Path:
     in_hand = handling(found.signals, trial.config, path, found.up * abs(trial.config.gyro.scale))
     if sum(b - a for a, b in in_hand.spans) > 0.5 * (path.times[-1] - path.times[0]):
         return path  # no robot is in hands for most of a drive: the gyro's unit or axes are wrong
-    found.handling = in_hand
     for code, what, spans in (
         ("motion.held", "The robot was held, or its wheels spun: they turn more than the gyro from ", in_hand.held),
         ("motion.lifted", "The robot was lifted or turned by hand, by gyro and accelerometer, from ", in_hand.lifted),
@@ -219,6 +218,4 @@ def _check_scale(found: Conventions, fit: RateFit) -> RateFit:
         )
         share = Figure(1.0 / factor, fit.scale.sigma / factor**2)
         found.add("wheels.turn", text, {"wheels.scale_omega": round(omega / factor, 4)}, share)
-    else:
-        found.compared.append(f"gyro and wheels turn alike ({factor:.3f} ± {fit.scale.sigma:.3f})")
     return fit

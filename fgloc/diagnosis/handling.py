@@ -222,10 +222,14 @@ class FloorWatch:
         self._landmarks, self._map = landmarks, landmark_map
         self._ups: list[FloatArray] = []
         self._turned: list[FloatArray] = []  # (5,) by the gyro [rad], time [s] and stretch: means over windows
-        self._force, self._sum, self._seconds = np.zeros(3), np.zeros(5), 0.0
         self._total = np.zeros(5)
+        self._begin()
         self._by_force = False
         self._looked_ns = 0
+
+    def _begin(self) -> None:
+        """Begin a window."""
+        self._force, self._sum, self._seconds = np.zeros(3), np.zeros(5), 0.0
 
     def observe(self, step: Step, by_hand: bool = False) -> None:
         """Collect the tilt of a step.
@@ -237,7 +241,7 @@ class FloorWatch:
         if by_hand:
             if self._seconds > 0.0 and self._ups and self._by_force:
                 del self._ups[-1], self._turned[-1]
-            self._force, self._sum, self._seconds = np.zeros(3), np.zeros(5), 0.0
+            self._begin()
             self._total[4] += 1.0
             return
         if len(self._ups) >= _MOST:
@@ -254,7 +258,7 @@ class FloorWatch:
             if self._seconds >= _WINDOW_S:
                 self._ups.append(self._force / np.linalg.norm(self._force))
                 self._turned.append(self._sum / self._seconds)
-                self._force, self._sum, self._seconds = np.zeros(3), np.zeros(5), 0.0
+                self._begin()
         elif not self._by_force and self._map is not None:
             self._look(step, self._map)
 

@@ -12,6 +12,8 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +44,7 @@ _MOST_PAIRS = 4000
 _FEWEST_TRACKS = 5  # landmarks times _TRACK_S: the errors of one track are alike, and fewer are no sample
 _MOST_LOG_SCALE = 10.0  # beyond any unit of length
 _GAINS = 2.5  # standard deviations of the gain from track to track: noise of the wheels gains up to 2.4
+_MOST_OF_TRACKS = 3000  # sightings, evenly chosen
 _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheels
 _MAP_WINDOWS_S = (8.0, 20.0, 50.0)  # over which landmarks are compared with a map: the shortest that shows three
 _COARSE_S = (20.0, 50.0, 120.0, 300.0)  # likewise where one is in view at a time
@@ -81,7 +84,6 @@ class Mounting:
         late_s: how much later the sensor's stamps are than the wheels'.
         turns: the robot's turn over the wheels': a path that turns too much looks like a sensor further back, or late.
         misfit: robust standard deviation of a landmark's place between two sightings, in the sensor's unit of length.
-        pairs: number of pairs of sightings.
     """
 
     axes: str
@@ -92,7 +94,6 @@ class Mounting:
     late_s: Figure
     turns: Figure
     misfit: float
-    pairs: int
 
 
 def planar(points: FloatArray, axes: str) -> ComplexArray:
@@ -109,11 +110,16 @@ def rotation_to_base(axes: str) -> FloatArray:
     return np.array([forward, left, np.cross(forward, left)])
 
 
+def _robust(errors: FloatArray) -> float:
+    """Standard deviation of errors about zero, by their median size."""
+    return MAD * float(np.median(np.abs(errors)))
+
+
 def _wander(heights: FloatArray, tracks: IntArray) -> float:
     """Robust standard deviation of heights within a track [m]: on a flat floor a landmark keeps its height."""
     _, number = np.unique(tracks, return_inverse=True)
     mean = np.bincount(number, heights) / np.bincount(number)
-    return MAD * float(np.median(np.abs(heights - mean[number])))
+    return _robust(heights - mean[number])
 
 
 def fit_sightings(
@@ -141,7 +147,7 @@ def fit_sightings(
                 found[name] = (misfit, late, alpha, beta)
     least = min((f[0] for f in found.values()), default=math.inf)
     return {
-        name: _refined(path, seen, name, planes[name], late, alpha, beta, len(first), turn_sigma)
+        name: _refined(path, seen, name, planes[name], late, alpha, beta, turn_sigma)
         for name, (misfit, late, alpha, beta) in found.items()
         if misfit < 5.0 * least or name == "body"
     }
@@ -187,14 +193,12 @@ def _refined(
     late: float,
     alpha: complex,
     beta: complex,
-    pairs: int,
     turn_sigma: float,
 ) -> Mounting:
     """Least squares in what the sensor reports, so that its noise does not shorten the scale; sigmas by a jackknife."""
-    keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
-    times, ids, z = seen.times[keep], seen.ids[keep], z[keep]
-    every = max(1, len(z) // 3000)
-    times, ids, z = times[::every], ids[::every], z[::every]
+    some = _known(path, seen, z)
+    some = some[:: max(1, len(some) // _MOST_OF_TRACKS)]
+    times, ids, z = seen.times[some], seen.ids[some], z[some]
     tracks = _tracks(times, ids)
     start = np.array([math.log(abs(alpha)), math.atan2(alpha.imag, alpha.real), beta.real, beta.imag, late, 0.0])
     start[2:4] = np.clip(start[2:4], -2.0, 2.0)
@@ -202,7 +206,7 @@ def _refined(
 
     def solve(use: NDArray[np.bool_], x0: FloatArray, sigma: float) -> tuple[FloatArray, _Places, FloatArray]:
         part = _Places(path, times[use], z[use], tracks[use], turn_sigma, sigma)
-        fit = least_squares(part.residuals, x0, loss="cauchy", f_scale=1.0, diff_step=1e-4, max_nfev=30)
+        fit = _fitted(part.residuals, x0)
         return fit.x, part, part.by_priors(fit.jac)
 
     everything = np.ones(len(z), dtype=bool)
@@ -224,7 +228,7 @@ def _refined(
     if abs(late) >= MOST_LAG_S or abs(scale) > _MOST_LOG_SCALE:  # it ran to where nothing tells
         sigmas = np.full(len(x), np.inf)
         late, scale = min(max(late, -MOST_LAG_S), MOST_LAG_S), min(max(scale, -_MOST_LOG_SCALE), _MOST_LOG_SCALE)
-    height = _wander(seen.points[keep][::every] @ rotation_to_base(name)[2], tracks) if seen.spatial else 0.0
+    height = _wander(seen.points[some] @ rotation_to_base(name)[2], tracks) if seen.spatial else 0.0
     return Mounting(
         name,
         Figure(math.exp(scale), math.exp(scale) * float(sigmas[0])),
@@ -234,7 +238,6 @@ def _refined(
         Figure(late, float(sigmas[4])),
         Figure(1.0 + turn, float(sigmas[5])),
         math.hypot(typical, height),
-        pairs,
     )
 
 
@@ -262,30 +265,41 @@ def compared(path: Path, first: Sightings, second: Sightings, m: Mounting, place
             along, across, _ = on_map.errors(on_map.adapted(_start(m)))
             times, ids = on_map.times, on_map.ids
         else:
-            keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
-            some = np.flatnonzero(keep)[:: max(1, int(keep.sum()) // 3000)]
+            some = _known(path, seen, z)
+            some = some[:: max(1, len(some) // _MOST_OF_TRACKS)]
             times, ids, z = seen.times[some], seen.ids[some], z[some]
             if len(z) < _FEWEST_ON_MAP:
                 return Figure(0.0, math.inf)
             part = _Places(path, times, z, _tracks(times, ids))
-            start = np.array([math.log(max(m.scale.value, 1e-9)), *_start(m)[2:]])
-            fit = least_squares(part.residuals, start, loss="cauchy", diff_step=1e-4, max_nfev=30)
-            along, across = np.split(part.residuals(fit.x)[: 2 * len(z)] * part.sigma, 2)
+            along, across = part.errors(_fitted(part.residuals, _of_track(m)).x)
         errors.append(np.array([along, across]))
         spreads.append(MAD * np.median(np.abs(errors[-1]), axis=1))
         tracks = np.unique(_tracks(times, ids), return_inverse=True)[1]
     least = np.maximum(np.min(spreads, axis=0), 1e-4)[:, None]
-    costs = [np.bincount(tracks, np.log1p((e / (CAUCHY * least)) ** 2).sum(axis=0)) for e in errors]
-    gains = (costs[0] - costs[1]) / np.bincount(tracks)
-    if len(gains) < _FEWEST_TRACKS:
-        return Figure(0.0, math.inf)
-    return Figure(float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains)) + 1e-9)
+    before, after = ((e / (CAUCHY * least)).ravel() for e in errors)
+    return _gain(before, after, tracks)
+
+
+def _known(path: Path, seen: Sightings, z: ComplexArray) -> IntArray:
+    """Indices of the sightings ``z (n,)`` about whose time the wheels' motion is known, whatever their lag."""
+    known = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1)
+    return np.flatnonzero(known & (np.abs(z) > 1e-6))
+
+
+def _fitted(residuals: Callable[[FloatArray], FloatArray], start: FloatArray) -> Any:
+    """Least squares with Cauchy's loss, as scipy has it."""
+    return least_squares(residuals, start, loss="cauchy", diff_step=1e-4, max_nfev=30)
 
 
 def _start(m: Mounting) -> FloatArray:
     """Start values ``(7,)`` of `_OnMap.solve` from a mounting."""
     place = np.clip([m.x.value, m.y.value], -1.0, 1.0)
     return np.array([0.0, 0.0, m.yaw.value, *place, m.late_s.value + _NUDGE_S, m.turns.value - 1.0 + _NUDGE_S])
+
+
+def _of_track(m: Mounting) -> FloatArray:
+    """Start values ``(6,)`` of `_Places.residuals` from a mounting."""
+    return np.array([math.log(max(m.scale.value, 1e-9)), *_start(m)[2:]])
 
 
 def _jackknifed(estimate: Callable[[NDArray[np.bool_]], FloatArray], *partitions: IntArray) -> FloatArray:
@@ -317,8 +331,8 @@ def _tracks(times: FloatArray, ids: IntArray) -> IntArray:
     return out
 
 
-def _gain(before: FloatArray, after: FloatArray, tracks: IntArray) -> float:
-    """Mean gain of cost of a track, in standard deviations by the scatter from track to track; 0: they are too few.
+def _gain(before: FloatArray, after: FloatArray, tracks: IntArray) -> Figure:
+    """Mean gain of cost of a track, with its sigma by the scatter from track to track; infinite: they are too few.
 
     What only noise explains fits better in some tracks and worse in others.
 
@@ -330,16 +344,18 @@ def _gain(before: FloatArray, after: FloatArray, tracks: IntArray) -> float:
     costs = [np.log1p(r**2).reshape(2, -1).sum(axis=0) for r in (before, after)]
     gains = np.bincount(tracks, costs[0] - costs[1]) / np.bincount(tracks)
     if len(gains) < _FEWEST_TRACKS:
-        return 0.0
-    return float(gains.mean()) / (float(gains.std(ddof=1)) / math.sqrt(len(gains)) + 1e-9)
+        return Figure(0.0, math.inf)
+    return Figure(float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains)) + 1e-9)
 
 
-def _as_sure(x: FloatArray, k: int, sigma: float, gain: Callable[[FloatArray, int], float]) -> float:
+def _as_sure(x: FloatArray, k: int, sigma: float, gain: Callable[[FloatArray, int], Figure]) -> float:
     """Sigma of the unknown ``k`` of a fit; where the fit gains by it no more than by noise, it is wider."""
     size = abs(float(x[k]))
-    if size < 2.0 * sigma or (gained := gain(x, k)) > _GAINS:
+    if size < 2.0 * sigma:
         return sigma
-    return max(sigma, size / max(gained, 0.5))
+    gained = gain(x, k)
+    gains = gained.value / gained.sigma
+    return sigma if gains > _GAINS else max(sigma, size / max(gains, 0.5))
 
 
 class _Places:
@@ -394,18 +410,19 @@ class _Places:
         means = np.linalg.pinv(J.T @ J + np.diag(information))[:, [2, 3, 5]] * (self._repeated / priors)
         return np.asarray(np.linalg.norm(means, axis=1))
 
-    def gain(self, x: FloatArray, k: int) -> float:
+    def gain(self, x: FloatArray, k: int) -> Figure:
         """Gain by the unknown ``k`` of a fit against 0; see `_gain`."""
-        others = np.delete(np.arange(len(x)), k)
 
         def without(rest: FloatArray) -> FloatArray:
-            whole = np.zeros(len(x))
-            whole[others] = rest
-            return self.residuals(whole)
+            return self.residuals(np.insert(rest, k, 0.0))
 
-        fit = least_squares(without, x[others], loss="cauchy", f_scale=1.0, diff_step=1e-4, max_nfev=30)
+        fit = _fitted(without, np.delete(x, k))
         n = 2 * len(self._z)
         return _gain(without(fit.x)[:n], self.residuals(x)[:n], self._tracks)
+
+    def errors(self, x: FloatArray) -> FloatArray:
+        """``(2, n)`` along and across the line of sight, over the range."""
+        return (self.residuals(x)[: 2 * len(self._z)] * self.sigma).reshape(2, -1)
 
     def spread(self, x: FloatArray) -> float:
         """Robust standard deviation of the residuals, without their unit."""
@@ -413,9 +430,7 @@ class _Places:
 
     def misfit(self, x: FloatArray) -> float:
         """Robust standard deviation of a landmark's place in the sensor's plane [m]."""
-        n = len(self._z)
-        off = self.residuals(x)[: 2 * n] * self.sigma
-        return MAD * float(np.median(np.hypot(off[:n], off[n:]) * np.abs(self._z)))
+        return _robust(np.hypot(*self.errors(x)) * np.abs(self._z))
 
 
 # --- landmarks against the map ----------------------------------------------------------------------------------------
@@ -430,14 +445,12 @@ class MapFit:
         mirrored: whether the map is a mirror image.
         shift: by how much the ids of the map are higher than those seen; 0 if they agree.
         misfit: robust residual over the spread of the landmarks: small if the map fits.
-        windows: number of stretches with three or more landmarks.
     """
 
     scale: Figure
     mirrored: bool
     shift: int
     misfit: float
-    windows: int
 
 
 def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, FloatArray]) -> MapFit | None:
@@ -453,17 +466,15 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
     alpha = mounting.scale.value * np.exp(1j * mounting.yaw.value)
     p, r = complex_poses(path, seen.times - mounting.late_s.value)
     q = p + r * (alpha * z + complex(mounting.x.value, mounting.y.value))
-    windows: list[dict[int, complex]] = []
     for width in _MAP_WINDOWS_S:  # a narrow view takes longer to see three landmarks
         windows = list(_places_seen(path, seen, q, width))
         if sum(len(window) > 2 for window in windows) >= _FEWEST_WINDOWS:
             break
     best: tuple[float, bool, int, list[float]] | None = None
-    for shift in (0, 1, -1):
-        for mirrored in (False, True):
-            scales, misfits = _laid_on(windows, places, shift, mirrored)
-            if len(misfits) >= _FEWEST_WINDOWS and (best is None or float(np.median(misfits)) < 0.5 * best[0]):
-                best = (float(np.median(misfits)), mirrored, shift, scales)
+    for shift, mirrored in product((0, 1, -1), (False, True)):
+        scales, misfits = _laid_on(windows, places, shift, mirrored)
+        if len(misfits) >= _FEWEST_WINDOWS and (best is None or float(np.median(misfits)) < 0.5 * best[0]):
+            best = (float(np.median(misfits)), mirrored, shift, scales)
     if best is None:
         return None
     misfit, mirrored, shift, scales = best
@@ -477,7 +488,7 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
         if len(part) >= _FEWEST_WINDOWS:
             left_out.append([float(np.median(part))])
     sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else scale * max(misfit, _OF_THREE)
-    return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit, len(scales))
+    return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit)
 
 
 def coarse_scale(
@@ -559,7 +570,6 @@ class Calibration:
         x: place of the sensor in the base frame [m].
         y: likewise.
         late_s: how much later its stamps are than the wheels'.
-        turns: the robot's turn over the wheels'.
         too_long_m: reported less true range at the median distance, which is known better than scale and bias.
         distance_m: that distance.
     """
@@ -570,7 +580,6 @@ class Calibration:
     x: Figure
     y: Figure
     late_s: Figure
-    turns: Figure
     too_long_m: Figure
     distance_m: float
 
@@ -649,7 +658,7 @@ class _OnMap:
         off = np.concatenate([along / self.sigma_m, across / self.sigma_rad])
         return np.where(np.isfinite(off), off, 1e3)
 
-    def gain(self, x: FloatArray, k: int) -> float:
+    def gain(self, x: FloatArray, k: int) -> Figure:
         """Gain by the unknown ``k`` of a fit against 0; a track is a landmark in a window. See `_gain`."""
         prior, start = self.PRIOR.copy(), x.copy()
         prior[k], start[k] = 1e-6, 0.0
@@ -681,8 +690,7 @@ class _OnMap:
         for _ in range(_ROUNDS):
             x = self.solve(x)
             along, across, _ = self.errors(x)
-            self.sigma_m = max(MAD * float(np.median(np.abs(along))), 0.005)
-            self.sigma_rad = max(MAD * float(np.median(np.abs(across))), 0.001)
+            self.sigma_m, self.sigma_rad = max(_robust(along), 0.005), max(_robust(across), 0.001)
         return x
 
 
@@ -706,7 +714,7 @@ def fit_on_map(
 
     def values(x: FloatArray) -> FloatArray:
         scale = math.exp(x[0])
-        return np.array([scale, *x[1:6], 1.0 + x[6], typical - scale * (typical - x[1])])
+        return np.array([scale, *x[1:6], typical - scale * (typical - x[1])])
 
     def sigmas(groups: IntArray) -> FloatArray:
         return _jackknifed(lambda use: values(on_map.take(use).solve(x)), groups)
@@ -719,10 +727,10 @@ def fit_on_map(
     s[-1] = math.hypot(by_time[-1], (noise.map_m or 0.0) / math.sqrt(len(np.unique(on_map.ids))))
     for k in (2, 5):  # as in `_refined`
         s[k] = _as_sure(x, k, float(s[k]), on_map.gain)
-    scale, bias, yaw, at_x, at_y, late, turns, too_long = (
+    scale, bias, yaw, at_x, at_y, late, too_long = (
         Figure(float(v), float(sigma)) for v, sigma in zip(values(x), s, strict=True)
     )
-    return Calibration(scale, bias, yaw, at_x, at_y, late, turns, too_long, typical), noise
+    return Calibration(scale, bias, yaw, at_x, at_y, late, too_long, typical), noise
 
 
 def _noise(on_map: _OnMap, x: FloatArray, along: FloatArray, across: FloatArray) -> Noise:
@@ -737,7 +745,7 @@ def _noise(on_map: _OnMap, x: FloatArray, along: FloatArray, across: FloatArray)
             mean[int(i)] = complex(np.median(off[own].real), np.median(off[own].imag))
     moved = np.array([mean.get(int(i), 0j) for i in on_map.ids])
     local = (off - moved) / unit
-    spread = [MAD * float(np.median(np.abs(part))) for part in (local.real, local.imag / np.abs(direction))]
+    spread = [_robust(part) for part in (local.real, local.imag / np.abs(direction))]
     parts = [v for one in mean.values() for v in (one.real, one.imag)]
     map_m = float(np.sqrt(np.mean(np.square(parts)))) if len(mean) > 2 else 0.0
     correlated = correlation_time(on_map.times, on_map.ids, np.asarray(local.real / max(spread[0], 1e-9)))
@@ -747,14 +755,11 @@ def _noise(on_map: _OnMap, x: FloatArray, along: FloatArray, across: FloatArray)
 def track_noise(path: Path, seen: Sightings, m: Mounting) -> Noise:
     """Noise of a sensor by the scatter of each landmark's place over some seconds, without a map."""
     z = planar(seen.points, m.axes)
-    keep = path.known(seen.times - MOST_LAG_S - 0.1, seen.times + MOST_LAG_S + 0.1) & (np.abs(z) > 1e-6)
-    times, ids, z = seen.times[keep], seen.ids[keep], z[keep]
-    part = _Places(path, times, z, _tracks(times, ids))
-    x = np.array([math.log(max(m.scale.value, 1e-9)), *_start(m)[2:]])
-    n = len(z)
-    off = part.residuals(x)[: 2 * n] * part.sigma
-    along, across = off[:n] * np.abs(z) * m.scale.value, off[n:]
-    sigma_m, sigma_rad = (MAD * float(np.median(np.abs(one))) for one in (along, across))
+    known = _known(path, seen, z)
+    times, ids, z = seen.times[known], seen.ids[known], z[known]
+    along, across = _Places(path, times, z, _tracks(times, ids)).errors(_of_track(m))
+    along = along * np.abs(z) * m.scale.value
+    sigma_m, sigma_rad = _robust(along), _robust(across)
     correlated = correlation_time(times, ids, along / max(sigma_m, 1e-9))
     return Noise(max(sigma_m, 0.003), max(sigma_rad, 0.0005), correlated, None)
 
@@ -766,7 +771,7 @@ def correlation_time(times: FloatArray, ids: IntArray, errors: FloatArray) -> fl
     """
     errors = np.clip(errors, -3.0, 3.0)
     width = 0.1
-    sums, counts = np.zeros(int(_LONGEST_CORRELATION_S / width) + 1), np.zeros(int(_LONGEST_CORRELATION_S / width) + 1)
+    sums, counts = np.zeros((2, int(_LONGEST_CORRELATION_S / width) + 1))
     for i in np.unique(ids):
         own = np.flatnonzero(ids == i)
         for step in range(1, 80):

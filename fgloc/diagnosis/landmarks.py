@@ -46,6 +46,7 @@ _GAIN, _GAIN_SIGMAS = 0.05, 3.0  # of the log-likelihood of a sighting, by which
 _BIASED = 3.0  # times the configured bias that ranges usually are: shorter ones are in another unit than it
 _ALIKE_OFF = 0.15  # logarithm by which way and turn may differ that are off by one cause
 _LOOKS_BACK_RAD = 2.0  # of a sensor: rather than two mistakes it is one, of wheels that count backwards
+_OPTICAL = "Positions of landmarks are in an optical frame (z ahead, x to the right): so they stay in place"
 _WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
@@ -152,30 +153,23 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
     if found.T_base_sensor is not None:
         fits = fit_sightings(path, raw, turn_sigma=turn_sigma) or {best.axes: best}
         chosen = min(fits.values(), key=lambda m: m.misfit) if by_map else _best(fits)
-    lines: dict[str, Any] = {}
     off_mm = 1e3 * chosen.scale.value * chosen.misfit
-    code, axes = "sightings.axes", "body"
-    if chosen.axes == "optical":
-        text = (
-            "Positions of landmarks are in an optical frame (z ahead, x to the right): so they stay in place while the "
-            f"wheels move, to {off_mm:.0f} mm; in the axes as configured they wander"
-        )
-        axes = "optical"
-    elif not seen.spatial:
+    pose = {"recording.sightings_pose": _pose_of(chosen, _place(found))}
+    if not seen.spatial:
         text = (
             "Bearings count to the right (or the sensor is upside down): mirrored, landmarks stay in place to "
             f"{off_mm:.0f} mm while the wheels move, as reported they wander"
         )
-        code = "sightings.mirrored"
+        found.add("sightings.mirrored", text, pose)
+    elif chosen.axes == "optical":
+        text = f"{_OPTICAL} while the wheels move, to {off_mm:.0f} mm; in the axes as configured they wander"
+        found.add("sightings.axes", text, {"recording.sightings_axes": "optical"} | pose)
     else:
         text = (
             f"Landmarks stay in place, to {off_mm:.0f} mm, if the sensor's axes are taken as "
             f"{chosen.axes}; in the axes as configured they wander"
         )
-    if code == "sightings.axes":
-        lines["recording.sightings_axes"] = axes
-    lines["recording.sightings_pose"] = _pose_of(chosen, _place(found))
-    found.add(code, text, lines)
+        found.add("sightings.axes", text, {"recording.sightings_axes": "body"} | pose)
     if chosen.scale.off(1.0, _SCALE) or found.landmark_map is not None:
         _scale(found, path, raw, chosen)
     found.noise = track_noise(path, raw, chosen)
@@ -304,9 +298,8 @@ def _optical_by_few(found: Conventions, seen: Sightings, fits: Mapping[str, Moun
     if optical.misfit < _NEARLY * best.misfit and _BY_FAR * optical.misfit < body.misfit:
         off_mm, other_mm = (1e3 * m.misfit for m in (optical, body))
         text = (
-            "Positions of landmarks are in an optical frame (z ahead, x to the right): so they stay in place "
-            f"to {off_mm:.0f} mm while the wheels move, in the configured axes to {other_mm:.0f} mm; of so few nothing "
-            "else is told"
+            f"{_OPTICAL} to {off_mm:.0f} mm while the wheels move, in the configured axes to {other_mm:.0f} mm; of so "
+            "few nothing else is told"
         )
         found.add("sightings.axes", text, {"recording.sightings_axes": "optical"})
 
@@ -389,22 +382,20 @@ def _pose_of(m: Mounting, T_given: FloatArray) -> list[float]:
 
 def _constants(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> Mounting:
     """Scale and mounting of a sensor whose axes are right."""
-    T, scaled = _place(found), m.scale.off(1.0, _SCALE)
-    before = len(found.findings)
-    if scaled or found.landmark_map is not None:
+    T, before = _place(found), len(found.findings)
+    if m.scale.off(1.0, _SCALE) or found.landmark_map is not None:
         _scale(found, path, seen, m)
     if len(found.findings) == before:
-        m, scaled = _by_map(found, path, seen, m, T), False
+        m = _by_map(found, path, seen, m, T)
     # the graph finds what is within the place's prior
     least = max(_PLACED_M, 3.0 * found.config.landmarks.position_sigma_m)
     place = [(k, f) for k, f in ((0, m.x), (1, m.y)) if f.off(T[k, 3], least) and f.sigma < 0.5 * _PLACED_M]
     turned = m.yaw.off(0.0, _TURNED_RAD)
-    degrees, sigma = math.degrees(m.yaw.value), math.degrees(m.yaw.sigma)
     if (place or turned) and varied(path):
         moved, what = T.copy(), []
         if turned:
             moved[:3, :3] = rpy_matrix(0.0, 0.0, m.yaw.value) @ T[:3, :3]
-            what.append(f"looks {degrees:+.1f} ± {sigma:.1f}° further left")
+            what.append(f"looks {math.degrees(m.yaw.value):+.1f} ± {math.degrees(m.yaw.sigma):.1f}° further left")
         for k, figure in place:
             moved[k, 3] = figure.value
             side = "ahead" if k == 0 else "left"
@@ -418,11 +409,6 @@ def _constants(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> 
             {"recording.sightings_pose": [round(v, 4) + 0.0 for v in pose]},
             m.yaw if turned else place[0][1],
             Severity.WARNING if by_other else Severity.ERROR,
-        )
-    if not (scaled or place or turned):
-        found.compared.append(
-            f"landmarks and wheels agree: scale {m.scale.value:.3f} ± {m.scale.sigma:.3f}, the sensor looks "
-            f"{degrees:+.1f} ± {sigma:.1f}° to the left"
         )
     return m
 

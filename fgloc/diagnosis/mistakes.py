@@ -60,14 +60,12 @@ class Mistakes:
         findings: one for each mistake, with the line to be set; none on a sound set-up.
         config: with the mistakes undone.
         landmark_map: likewise; None: the file is taken as it is.
-        undone: whether ``config`` and ``landmark_map`` are not as they were given.
         checked: whether anything was looked for.
     """
 
     findings: tuple[Finding, ...]
     config: Config
     landmark_map: LandmarkMap | None = None
-    undone: bool = False
     checked: bool = False
 
     @property
@@ -102,7 +100,7 @@ def find_mistakes(path: Path, map_path: Path | None, config: Config) -> Mistakes
         if any(finding.code in _OF_WHEELS and not finding.lines for finding in findings):
             said += " What the truth alone says of the wheels is not applied."
         findings += note("setup.corrected", [said])
-    return Mistakes(tuple(findings), now, landmark_map, undone, checked=True)
+    return Mistakes(tuple(findings), now, landmark_map, checked=True)
 
 
 def _seeing(path: Path, config: Config) -> tuple[str, ...]:
@@ -337,7 +335,7 @@ class _Search:
         for picture in (p for row in excerpt.pictures for p in row):
             event = CornersEvent(picture.stamp_ns, picture.stamp_ns, "", "", picture.seen)
             at_s = (picture.stamp_ns - signals.origin_ns) * 1e-9
-            signals.seen.extend((at_s, s.landmark_id, *s.point.tolist()) for s in corners.sightings(event, at_s))
+            signals.seen.extend((at_s, s.landmark_id, *s.point.tolist()) for s in corners.sightings(event))
         found = conventions(signals, config, camera.T_base_cam, up, landmark_map).findings
         yield from filter(None, (by_places(finding, landmark_map) for finding in found))
 
@@ -368,8 +366,7 @@ class _Search:
         self._change(section, **values)
 
     def _change(self, section: str, **values: object) -> None:
-        part = getattr(self.config, section).model_copy(update=values)
-        self.config = self.config.model_copy(update={section: part})
+        self.config = with_values(self.config, section, values)
 
 
 # --- While a run goes on ----------------------------------------------------------------------------------------------
@@ -436,7 +433,7 @@ class Diagnosis:
         at_s = (event.stamp_ns - signals.origin_ns) * 1e-9
         if abs(at_s - self._looked_s) >= _SPARSE_S:
             self._looked_s, signals.spatial = at_s, True
-            signals.seen += [(at_s, s.landmark_id, *s.point.tolist()) for s in self._corners.sightings(event, at_s)]
+            signals.seen += [(at_s, s.landmark_id, *s.point.tolist()) for s in self._corners.sightings(event)]
 
     def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
         """Watch the floor over a step.

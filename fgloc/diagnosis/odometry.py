@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from fgloc.config import with_value
 from fgloc.diagnosis.comparison import WHEELS, Conventions, unit_of
 from fgloc.diagnosis.pairs import FOLLOWS, ROUGHLY, SKID, TELLS, VARIED, Figure, fit_rate, fit_way, irls, weighted
 from fgloc.diagnosis.signals import SILENT_S, Path, in_order, turn_by
@@ -170,14 +169,8 @@ def _check_yaw_of_gyro(found: Conventions) -> None:
     by_gyro = np.diff(np.interp(at, times, turn_by(times, omega @ found.up)))
     yaw = np.diff(np.interp(at, rows[:, 0], np.unwrap(rows[:, 3])))
     lines = {f"wheels.{key}": value for key, value in given.items()}
-    with_angles = found.config
-    try:
-        for key, value in lines.items():
-            with_angles = with_value(with_angles, key, value)
-    except ValueError:  # no wheels are like this: the angles have another unit
-        return
-    angles = found.signals.path(with_angles)
-    if angles is None:
+    angles = found.path_with(lines)
+    if angles is None:  # no wheels are like this: the angles have another unit
         return
     by_wheels = np.diff(np.interp(at, angles.times, angles.poses[:, 2]))
     known = angles.known(at[:-1], at[1:]) & (np.diff(np.interp(at, times, np.arange(len(times)))) > _SAMPLES)
@@ -259,7 +252,7 @@ def check_angles(found: Conventions, path: Path) -> Path:
         found.add("wheels.sign", text, found.right_sides())
     else:
         return path
-    return found.signals.path(found.config) or path
+    return found.read_again(path)
 
 
 def driver_late(found: Conventions, path: Path) -> Figure | None:

@@ -242,9 +242,11 @@ def check_ranges(found: Conventions, path: Path) -> Path:
         return path
     given = found.config.wheels
     refuted = fit.misfit * _WORSE < fit.as_given and fit.misfit * _RIVAL < fit.rival
-    if refuted and fit.turn.off(1.0, _TURN_OFF, 4.0) and "imu" not in _told(found):
+    gyro_agrees = found.signals.rates() is not None and not found.opposite  # with the wheels: no range refutes it
+    turns = refuted and fit.turn.off(1.0, _TURN_OFF, 4.0)
+    if turns and not gyro_agrees:
         _turn(found, fit.turn)
-    elif refuted and "imu" in _told(found) and fit.turn.off(1.0, _TURN_OFF, 4.0) and not fit.turn.off(-1.0, _TURN_OFF):
+    elif turns and not fit.turn.off(-1.0, _TURN_OFF):
         text = (
             "The anchors are a mirror image of where they stand: wheels and gyro agree on left and right, ranges do "
             "not (or the odometry has its turns from a gyro that is mounted the wrong way up)"
@@ -258,12 +260,7 @@ def check_ranges(found: Conventions, path: Path) -> Path:
         text = f"The wheels' way is {1.0 / fit.way.value:.3f} ± {fit.way.sigma:.2g} times what ranges and anchors show"
         found.add("wheels.scale", text, {"wheels.scale_v": round(given.scale_v * fit.way.value, 5)}, fit.way)
     _long(found, fit)
-    return path if found.config.wheels == given else found.signals.path(found.config) or path
-
-
-def _told(found: Conventions) -> set[str]:
-    """Sensors whose turn agrees with the wheels', so that no range refutes it."""
-    return {"imu"} if found.signals.rates() is not None and not found.opposite else set()
+    return path if found.config.wheels == given else found.read_again(path)
 
 
 def _turn(found: Conventions, turn: Figure) -> None:
@@ -273,7 +270,6 @@ def _turn(found: Conventions, turn: Figure) -> None:
         lines = {"wheels.track": round(wheels.track / size, 4)}
         lines |= found.right_sides() if turn.value < 0.0 else {}
     much = f"{size:.3f} ± {turn.sigma:.2g} times as much as by its wheels"
-    why = "the distance of the wheels is wrong" if turn.value > 0.0 else ""
     if turn.value < 0.0:
         text = "By the ranges the robot turns the other way than by its wheels: left and right are exchanged"
         text += " (or, if they are not, the anchors are a mirror image)"
@@ -281,7 +277,8 @@ def _turn(found: Conventions, turn: Figure) -> None:
             text += f", and {much}: their distance is wrong, too"
         found.add("wheels.sign", text, lines, turn)
     else:
-        found.add("wheels.turn", f"By the ranges the robot turns {much}: {why}", lines, turn)
+        text = f"By the ranges the robot turns {much}: the distance of the wheels is wrong"
+        found.add("wheels.turn", text, lines, turn)
 
 
 def _long(found: Conventions, fit: RangeFit) -> None:

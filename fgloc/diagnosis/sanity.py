@@ -19,9 +19,10 @@ import math
 from array import array
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.config import Config, camera_role
@@ -108,6 +109,17 @@ class Track:
     landmarks: Mapping[int, FloatArray] | None
     scale_sigma: float  # of the wheels, as configured
     turn_sigma: float
+
+    def seen(self, chosen: NDArray[np.bool_] | IntArray) -> Track:
+        """The track with some of its sightings, by mask or index."""
+        own = (self.seen_ns[chosen], self.ids[chosen], self.places[chosen], self.sigmas[chosen])
+        return replace(self, seen_ns=own[0], ids=own[1], places=own[2], sigmas=own[3])
+
+    def surveyed(self) -> tuple[Track, FloatArray]:
+        """The track with the sightings of known landmarks alone, and where these are ``(k, 2)``; there is a map."""
+        assert self.landmarks is not None
+        seen = self.seen(np.array([i in self.landmarks for i in self.ids.tolist()], dtype=bool))
+        return seen, np.array([self.landmarks[i] for i in seen.ids.tolist()]).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +249,7 @@ class Sanity:
                 continue
             if camera is not None and camera_role(camera.name, "corners") in self._knocked:
                 continue
-            for sighting in self._collector.sightings(event, 0.0):
+            for sighting in self._collector.sightings(event):
                 place = (T[:3, :3] @ sighting.point + T[:3, 3])[:2]
                 sigma = math.hypot(sighting.sigma_m, sighting.sigma_rad * math.hypot(place[0], place[1]))
                 yield event.stamp_ns, sighting.landmark_id, place, sigma
@@ -465,14 +477,7 @@ def _textbook(track: Track, alone: FloatArray, laid: FloatArray, explained: floa
     if solved is None:
         return None
     poses, covs = solved
-    inside = (track.seen_ns >= some.stamps_ns[0]) & (track.seen_ns <= some.stamps_ns[-1])
-    some = replace(
-        some,
-        seen_ns=track.seen_ns[inside],
-        ids=track.ids[inside],
-        places=track.places[inside],
-        sigmas=track.sigmas[inside],
-    )
+    some = some.seen((track.seen_ns >= some.stamps_ns[0]) & (track.seen_ns <= some.stamps_ns[-1]))
     theirs = compared(some, poses, alone[kept])
     if departs(theirs.departure, theirs.strain, mapped=False) or theirs.explained < max(explained + _MORE, _WELL):
         return None
@@ -612,11 +617,10 @@ def _windows(track: Track, poses: FloatArray, odometry: FloatArray) -> list[Wind
 
 def _distances(track: Track, poses: FloatArray) -> FloatArray:
     """Whitened distances ``(k,)`` of the sightings from their landmarks under a trajectory."""
-    places = se2.placed(se2.interpolate(track.stamps_ns, poses, track.seen_ns), track.places)
     if track.landmarks is not None:
-        known = np.array([i in track.landmarks for i in track.ids.tolist()], dtype=bool)
-        where = np.array([track.landmarks[i] for i in track.ids[known].tolist()]).reshape(-1, 2)
-        return np.asarray(np.hypot(*(places[known] - where).T) / track.sigmas[known], dtype=float)
+        seen, where = track.surveyed()
+        return np.asarray(np.hypot(*(_seen_from(seen, poses) - where).T) / seen.sigmas, dtype=float)
+    places = _seen_from(track, poses)
     away = np.full(len(places), np.nan)
     for landmark_id in np.unique(track.ids):
         same = np.flatnonzero(track.ids == landmark_id)
@@ -624,6 +628,11 @@ def _distances(track: Track, poses: FloatArray) -> FloatArray:
             middle = np.median(places[same], axis=0)
             away[same] = np.hypot(*(places[same] - middle).T) / track.sigmas[same]
     return np.asarray(away[np.isfinite(away)])
+
+
+def _seen_from(track: Track, poses: FloatArray) -> FloatArray:
+    """Places ``(m, 2)`` of the sightings in the frame of a trajectory ``(n, 3)``."""
+    return se2.placed(se2.interpolate(track.stamps_ns, poses, track.seen_ns), track.places)
 
 
 def laid_onto(track: Track, odometry: FloatArray, first: FloatArray) -> FloatArray:
@@ -637,11 +646,10 @@ def laid_onto(track: Track, odometry: FloatArray, first: FloatArray) -> FloatArr
     begun = se2.compose_array(first, odometry)
     if track.landmarks is None or len(track.ids) < _SIGHTINGS:
         return begun
-    known = np.array([i in track.landmarks for i in track.ids.tolist()], dtype=bool)
-    if known.sum() < _SIGHTINGS:
+    seen, where = track.surveyed()
+    if len(where) < _SIGHTINGS:
         return begun
-    where = np.array([track.landmarks[i] for i in track.ids[known].tolist()])
-    places = se2.placed(se2.interpolate(track.stamps_ns, odometry, track.seen_ns[known]), track.places[known])
+    places = _seen_from(seen, odometry)
     T, weights = np.asarray(first, dtype=float), np.ones(len(places))
     for _ in range(_ITERATIONS):
         T = se2.rigid(places, where, weights)
@@ -682,15 +690,18 @@ class _Compared:
     away: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Edge:
-    """Between two windows: time, the estimate, and the odometry from there on to the next edge."""
+@dataclass(slots=True, eq=False)
+class _Stretch:
+    """A window as the run goes on: the estimate at its begin, the odometry since, and how both compare at its end.
 
-    stamp_ns: int
+    ``window`` is None before the end, and in rest.
+    """
+
     estimate: Estimate
-    motion: FloatArray
-    cov: FloatArray
-    path: float
+    motion: FloatArray = field(default_factory=lambda: np.zeros(3))
+    cov: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    path: float = 0.0
+    window: Window | None = None
 
 
 NO_BOUND = Protection(np.full(3, np.inf), math.inf, "odometry", alert=True)
@@ -711,18 +722,21 @@ class Watch:
             config: as the run uses it.
         """
         self._mapped, self._config = mapped, config
-        self._edges: deque[_Edge] = deque(maxlen=_WATCHED)  # with what was driven from each to the next
-        self._windows: deque[Window | None] = deque(maxlen=_WATCHED)  # one for each edge; None: in rest
+        self._stretches: deque[_Stretch] = deque(maxlen=_WATCHED)
         self._seen: deque[_Compared] = deque(maxlen=_MOST_WATCHED)
-        self._odometry = np.zeros(3)  # from where it began
-        self._start: Estimate | None = None  # of the window that is not complete, and what was driven since
-        self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
-        self._carried: tuple[FloatArray, FloatArray] | None = None  # pose and covariance, right perturbation
-        self._given: FloatArray | None = None  # pose that was given last ...
-        self._predicted: FloatArray | None = None  # ... and where the odometry leads from it
+        self._predicted: FloatArray | None = None  # where the odometry leads from the pose that was given last
+        self._restart(None)
         self._first_ns: int | None = None
         self._spans: list[tuple[float, float]] = []  # [s] from the first pose, in which the odometry was given
         self._why = ""
+
+    def _restart(self, estimate: Estimate | None) -> None:
+        self._stretches.clear()
+        self._seen.clear()
+        self._odometry = np.zeros(3)  # from where it began
+        self._open = None if estimate is None else _Stretch(estimate)
+        self._carried: tuple[FloatArray, FloatArray] | None = None  # pose and covariance, right perturbation
+        self._given: FloatArray | None = None if estimate is None else estimate.pose  # pose that was given last
 
     def checked(
         self,
@@ -792,32 +806,22 @@ class Watch:
         """Finding on the times at which the odometry was given in place of the estimate; empty if it never was."""
         return () if self.sentence is None else (Finding("sanity.odometry", self.sentence, Severity.ERROR),)
 
-    def _restart(self, estimate: Estimate | None) -> None:
-        self._edges.clear()
-        self._windows.clear()
-        self._seen.clear()
-        self._odometry = np.zeros(3)
-        self._start, self._carried = estimate, None
-        self._given = None if estimate is None else estimate.pose
-        self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
-
     def _drive(self, step: Step, measured: MotionMeasurement, estimate: Estimate, finite: bool) -> None:
         """Add a step to the window, and close it where it is long enough."""
-        if self._start is None:
-            self._start = estimate
+        now = self._open
+        if now is None:
+            self._open = _Stretch(estimate)
             return
-        self._motion = se2.compose(self._motion, measured.motion)
-        self._cov = se2.compose_cov(self._cov, measured.motion, measured.cov)
-        self._path += math.hypot(measured.motion[0], measured.motion[1])
-        if (step.stamp_ns - self._start.stamp_ns) * 1e-9 < _WINDOW_S:
+        now.motion = se2.compose(now.motion, measured.motion)
+        now.cov = se2.compose_cov(now.cov, measured.motion, measured.cov)
+        now.path += math.hypot(measured.motion[0], measured.motion[1])
+        begun = now.estimate
+        if (step.stamp_ns - begun.stamp_ns) * 1e-9 < _WINDOW_S:
             return
-        window = None
-        if finite and np.isfinite(self._start.pose).all():
-            window = Window.of(self._motion, self._cov, self._path, se2.between(self._start.pose, estimate.pose))
-        self._edges.append(_Edge(self._start.stamp_ns, self._start, self._motion, self._cov, self._path))
-        self._windows.append(window)
-        self._start = estimate
-        self._motion, self._cov, self._path = np.zeros(3), np.zeros((3, 3)), 0.0
+        if finite and np.isfinite(begun.pose).all():
+            now.window = Window.of(now.motion, now.cov, now.path, se2.between(begun.pose, estimate.pose))
+        self._stretches.append(now)
+        self._open = _Stretch(estimate)
 
     def _failure(self, step: Step, estimate: Estimate, finite: bool) -> str | None:
         """Evidence against the estimate as it is now; None: there is none."""
@@ -834,7 +838,7 @@ class Watch:
             explained = float(np.mean(away < _EXPLAINED))
             if not supported(explained, float(np.median(away))) and self._is_better_by_odometry(explained):
                 return f"it explains {_percent(explained)} of the sightings of {_SEEN_S:.0f} s"
-        moving = [w for w in self._windows if w is not None]
+        moving = [s.window for s in self._stretches if s.window is not None]
         if not self._mapped and self._predicted is not None:
             leap = math.hypot(*(estimate.pose - self._predicted)[:2])
             if leap > _LEAP_M + self._config.gate.max_speed * step.dt:
@@ -853,7 +857,7 @@ class Watch:
         One that goes on from the estimate itself explains as many and is no better: only if that is next to none.
         """
         carried = self._carried
-        if carried is None and not any(self._strained()):
+        if carried is None and not any(map(self._strained, self._stretches)):
             return explained < _MORE
         carried = carried or self._last_sane()
         if carried is None:
@@ -864,9 +868,10 @@ class Watch:
         near = np.hypot(*off.T) < _EXPLAINED * np.array([one.seen.sigma for one in self._seen])
         return float(np.mean(near)) > explained - _MORE
 
-    def _strained(self) -> list[bool]:
-        """Whether the estimate departs from the odometry, by window in which the robot moves."""
-        return [w is not None and departs(w.departure, w.strain, self._mapped) for w in self._windows]
+    def _strained(self, stretch: _Stretch) -> bool:
+        """Whether the estimate departs from the odometry in a window in which the robot moves."""
+        window = stretch.window
+        return window is not None and departs(window.departure, window.strain, self._mapped)
 
     def _returned(self, estimate: Estimate) -> bool:
         """Whether an estimate that has failed can be given again; without a map it must be near the odometry."""
@@ -878,19 +883,18 @@ class Watch:
 
     def _last_sane(self) -> tuple[FloatArray, FloatArray] | None:
         """Pose and covariance now: those before the first window that departs, with the odometry since."""
-        first = next((i for i, strained in enumerate(self._strained()) if strained), len(self._windows))
-        edges = list(self._edges)
-        pending = [] if self._start is None else [_Edge(0, self._start, self._motion, self._cov, self._path)]
-        edges = [*edges, *pending][first if first < len(edges) else max(len(edges) - 1, 0) :]
-        while edges and not np.isfinite(edges[0].estimate.pose).all():
-            edges = edges[1:]
-        if not edges:
+        last = max(len(self._stretches) - 1, 0)
+        first = next((i for i, stretch in enumerate(self._stretches) if self._strained(stretch)), last)
+        stretches = [*self._stretches, *(() if self._open is None else (self._open,))][first:]
+        while stretches and not np.isfinite(stretches[0].estimate.pose).all():
+            stretches = stretches[1:]
+        if not stretches:
             return None
-        begun = edges[0].estimate
+        begun = stretches[0].estimate
         pose, cov = begun.pose, se2.rotate_cov(begun.cov, -float(begun.pose[2]))
-        for edge in edges:
-            cov = se2.compose_cov(cov, edge.motion, edge.cov * _CONTRADICTED**2)
-            pose = se2.compose(pose, edge.motion)
+        for stretch in stretches:
+            cov = se2.compose_cov(cov, stretch.motion, stretch.cov * _CONTRADICTED**2)
+            pose = se2.compose(pose, stretch.motion)
         return pose, cov
 
     def _note(self, step: Step) -> None:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from fgloc.config import Config, Role, one_line, setting
 from fgloc.diagnosis.comparison import unit_of
 from fgloc.diagnosis.setup_fit import EXTRAS, Excerpt, Fit, Problem, Setup, Stretch, tells_place
-from fgloc.frames import OPTICAL_TO_BODY, quaternion_matrix, rotation_of, rpy_matrix, sensor_pose
+from fgloc.frames import OPTICAL_TO_BODY, homogeneous, quaternion_matrix, rotation_of, rpy_matrix, sensor_pose
 from fgloc.sensors.base import with_values
 from fgloc.sensors.wheels.sensor import SetupMistake, correct
 from fgloc.types import Camera, Finding, FloatArray, Landmark, LandmarkMap, Severity
@@ -75,10 +75,12 @@ def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Itera
     yield Change("distortion", setup, {"camera.k1": _WIDE, "camera.k2": _WIDE})
     yield Change("focal", setup, {"camera.focal": _WIDE})
     for factor in (0.5, 2.0):
-        yield Change("resolution", _scaled(setup, factor), {"camera.focal": 0.02})
+        K = setup.camera.K * np.array([[factor], [factor], [1.0]])
+        yield Change("resolution", _with_camera(setup, K=K), {"camera.focal": 0.02})
     turned = {f"camera.r{axis}_rad": _WIDE for axis in "xyz"}
     yield Change("mounting", setup, turned)
-    yield from (Change("mounting", _mounted(setup, T), turned) for T in _mountings(setup.camera.T_base_cam))
+    for T in _mountings(setup.camera.T_base_cam):
+        yield Change("mounting", _with_camera(setup, T_base_cam=T), turned)
     yield Change("position", setup, {f"camera.{axis}_m": _WIDE for axis in "xyz"})
     yield Change("mirrored", replace(setup, landmark_map=mirrored(setup.landmark_map)))
     yield Change("quaternions", replace(setup, landmark_map=reordered(setup.landmark_map)))
@@ -112,16 +114,11 @@ def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Itera
 
 def refined(change: Change, fit: Fit) -> Change:
     """Change whose set-up includes the fitted values: the next fit starts there."""
-    setup, values = change.setup, {name: fit.values[name][0] for name in fit.values}
-    camera, extras = setup.camera, setup.extras.copy()
-    for name in change.free:
-        if name in EXTRAS:
-            extras[EXTRAS.index(name)] = values[name]
-    K, D, T = (
-        camera.K.copy(),
-        np.concatenate([camera.D, np.zeros(4)])[: max(4, len(camera.D))],
-        camera.T_base_cam.copy(),
-    )
+    values = {name: value for name, (value, _) in fit.values.items()}
+    setup = _with(change.setup, **{name: values[name] for name in change.free if name in EXTRAS})
+    camera = setup.camera
+    K, T = camera.K.copy(), camera.T_base_cam.copy()
+    D = np.concatenate([camera.D, np.zeros(4)])[: max(4, len(camera.D))]
     if "camera.focal" in change.free:
         K[[0, 1], [0, 1]] *= 1.0 + values["camera.focal"]
     if "camera.k1" in change.free:
@@ -130,13 +127,12 @@ def refined(change: Change, fit: Fit) -> Change:
         T[:3, :3] = T[:3, :3] @ rotation_of(np.array([values[f"camera.r{axis}_rad"] for axis in "xyz"]))
     if "camera.x_m" in change.free:
         T[:3, 3] += T[:3, :3] @ np.array([values[f"camera.{axis}_m"] for axis in "xyz"])
-    return replace(change, setup=replace(setup, camera=replace(camera, K=K, D=D, T_base_cam=T), extras=extras))
+    return replace(change, setup=_with_camera(setup, K=K, D=D, T_base_cam=T))
 
 
 def gross(change: Change, given: Setup) -> bool:
     """Whether a change that was found is more than an ordinary installation's error."""
-    setup, kind = change.setup, change.kind
-    values = dict(zip(EXTRAS, setup.extras.tolist(), strict=True))
+    setup, kind, values = change.setup, change.kind, change.setup.values
     if kind in ("size", "map_scale", "radius", "track"):
         return bool(abs(values[kind]) > _LEAST[kind])
     if kind == "image_clock" and change.has_gyro and abs(values["late_s"] - values["gyro_late_s"]) > _LEAST["late"]:
@@ -182,35 +178,41 @@ def by_places(finding: Finding, landmark_map: LandmarkMap) -> tuple[Finding, Lan
     Returns:
         None: the finding is on something else.
     """
-    known, value = landmark_map.landmarks, finding.value
+    value = finding.value
     unit = None if value is None else unit_of(value)
     factor = unit[0] if unit is not None else value or 1.0
-    changed: dict[int, Landmark] = {}
     if finding.code == "map.mirrored":
         return finding, mirrored(landmark_map)
     if finding.code == "map.ids" and value is not None:
-        moved = {i - round(value): m for i, m in known.items()}
+        moved = {i - round(value): m for i, m in landmark_map.landmarks.items()}
         changed = {i: replace(m, landmark_id=i) for i, m in moved.items() if i >= 0}
-    elif finding.code == "map.unit":
-        changed = {i: replace(m, position=factor * m.position) for i, m in known.items()}
-    elif finding.code == "sightings.scale":
-        changed = {i: replace(m, size_m=factor * m.size_m) for i, m in known.items()}
+        return (finding, replace(landmark_map, landmarks=changed)) if changed else None
+    if finding.code == "map.unit":
+        return finding, scaled(landmark_map, positions=factor)
+    if finding.code == "sightings.scale":
         text = (
             f"The markers' sizes are {1.0 / factor:.4g} times those that wheels and map agree on: correct them there."
         )
-        finding = replace(finding, code="map.size", text=text, lines={})
-    elif finding.code == "wheels.scale" and unit is not None:
+        return replace(finding, code="map.size", text=text, lines={}), scaled(landmark_map, sizes=factor)
+    if finding.code == "wheels.scale" and unit is not None:
         factor = 1.0 / factor
-        changed = {i: replace(m, position=factor * m.position, size_m=factor * m.size_m) for i, m in known.items()}
         lines = shown("map", {"scale": factor, "size_scale": factor})
         text = (
             f"Positions and sizes on the map are {1.0 / factor:.4g} times what the wheels show: they are in another "
-            "unit, or the wheels' are; if it is the map, set "
-            + " and ".join(f"{key}: {value}" for key, value in lines.items())
-            + "."
+            f"unit, or the wheels' are; if it is the map, set {' and '.join(f'{k}: {v}' for k, v in lines.items())}."
         )
         finding = replace(finding, code="map.unit", text=text, lines=lines, value=factor)
-    return (finding, replace(landmark_map, landmarks=changed)) if changed else None
+        return finding, scaled(landmark_map, positions=factor, sizes=factor)
+    return None
+
+
+def scaled(landmark_map: LandmarkMap, positions: float = 1.0, sizes: float = 1.0) -> LandmarkMap:
+    """The map with its positions and its markers' sizes so many times as large."""
+    known = {
+        i: replace(m, position=positions * m.position, size_m=sizes * m.size_m)
+        for i, m in landmark_map.landmarks.items()
+    }
+    return replace(landmark_map, landmarks=known)
 
 
 def reordered(landmark_map: LandmarkMap) -> LandmarkMap:
@@ -239,36 +241,20 @@ def _swaps(fit: Fit) -> Iterator[tuple[int, int]]:
 
 def _mountings(T: FloatArray) -> Iterator[FloatArray]:
     """Other places of a camera, in optical axes."""
-    rolls = [_turned_by(T, rpy_matrix(0.0, 0.0, math.radians(d))) for d in (180.0, 90.0, -90.0)]
-    yaws = [_before(T, _about_z(d)) for d in (180.0, 90.0, -90.0)]
-    yield from (*rolls, *yaws, _turned_by(T, OPTICAL_TO_BODY), _turned_by(T, OPTICAL_TO_BODY.T))
+    R = T[:3, :3]
+    quarters = [_about_z(degrees) for degrees in (180.0, 90.0, -90.0)]
+    rolls, yaws = [R @ quarter for quarter in quarters], [quarter @ R for quarter in quarters]
+    for turned in (*rolls, *yaws, R @ OPTICAL_TO_BODY, R @ OPTICAL_TO_BODY.T):
+        yield homogeneous(turned, T[:3, 3])
     yield np.asarray(np.linalg.inv(T))
-
-
-def _turned_by(T: FloatArray, R: FloatArray) -> FloatArray:
-    turned = T.copy()
-    turned[:3, :3] = T[:3, :3] @ R
-    return turned
-
-
-def _before(T: FloatArray, R: FloatArray) -> FloatArray:
-    turned = T.copy()
-    turned[:3, :3] = R @ T[:3, :3]
-    return turned
 
 
 def _about_z(degrees: float) -> FloatArray:
     return rpy_matrix(0.0, 0.0, math.radians(degrees))
 
 
-def _mounted(setup: Setup, T: FloatArray) -> Setup:
-    return replace(setup, camera=replace(setup.camera, T_base_cam=T))
-
-
-def _scaled(setup: Setup, factor: float) -> Setup:
-    K = setup.camera.K.copy()
-    K[:2] *= factor
-    return replace(setup, camera=replace(setup.camera, K=K))
+def _with_camera(setup: Setup, **values: FloatArray) -> Setup:
+    return replace(setup, camera=replace(setup.camera, **values))  # type: ignore[arg-type]
 
 
 def _with(setup: Setup, **values: float) -> Setup:
@@ -315,7 +301,7 @@ def correction(change: Change, given: Setup, source: str, image: Role, wheels: R
         image: role whose stamps the sightings have.
         wheels: likewise of the wheels.
     """
-    values = dict(zip(EXTRAS, change.setup.extras.tolist(), strict=True))
+    values = change.setup.values
     match change.kind:
         case "size":
             return _size(given, math.exp(values["size"]))
@@ -342,45 +328,42 @@ def _size(given: Setup, factor: float) -> Correction:
     shown, line = f"{sizes[0]:.4g} to {sizes[-1]:.4g} m", f"multiply every size by {factor:.4f}"
     if len(sizes) == 1:
         shown, line = f"{sizes[0]:.4g} m", f"set size: {sizes[0] * factor:.4g} for every marker"
-    known = {i: replace(m, size_m=factor * m.size_m) for i, m in given.landmark_map.landmarks.items()}
     text = (
         f"The markers' size is {shown} by the map, and {factor:.3f} times that by their places and the images: "
         f"{line} in the map."
     )
     finding = Finding("map.size", text, Severity.ERROR, value=factor)
-    return Correction(finding, given.config, replace(given.landmark_map, landmarks=known))
+    return Correction(finding, given.config, scaled(given.landmark_map, sizes=factor))
 
 
 def _map_scale(given: Setup, factor: float) -> Correction:
-    known = {i: replace(m, position=factor * m.position) for i, m in given.landmark_map.landmarks.items()}
     scale = given.config.map.scale * factor
     text = (
         f"Distances on the map are {1.0 / factor:.4g} times those that wheels and markers show: the map's scale is "
         f"wrong; multiply its positions by {factor:.5g}, or set {setting('map.scale')}: {scale:.5g}."
     )
     finding = Finding("map.unit", text, Severity.ERROR, shown("map", {"scale": round(scale, 6)}), factor)
-    return Correction(finding, given.config, replace(given.landmark_map, landmarks=known))
+    return Correction(finding, given.config, scaled(given.landmark_map, positions=factor))
+
+
+_OF_MAP = {
+    "mirrored": (
+        "The map is mirrored against what wheels and camera show: change the sign of the y of all its positions "
+        "(and of its markers' directions)."
+    ),
+    "quaternions": (
+        "The map's quaternions are in the order w, x, y, z: so the markers face the way that the camera sees them; "
+        "write them as x, y, z, w."
+    ),
+    "ids": "The map has ids {0} and {1} in each other's place: exchange ids {0} and {1} in the map.",
+}
 
 
 def _map(change: Change, given: Setup) -> Correction:
-    code = "map.mirrored"
-    if change.kind == "mirrored":
-        sentence = (
-            "The map is mirrored against what wheels and camera show: change the sign of the y of all its positions "
-            "(and of its markers' directions)."
-        )
-    elif change.kind == "quaternions":
-        code = "map.quaternions"
-        sentence = (
-            "The map's quaternions are in the order w, x, y, z: so the markers face the way that the camera sees them; "
-            "write them as x, y, z, w."
-        )
-    else:
-        code = "map.ids"
-        before, after = given.landmark_map.landmarks, change.setup.landmark_map.landmarks
-        a, b = sorted(i for i in before if not np.array_equal(before[i].position, after[i].position))
-        sentence = f"The map has ids {a} and {b} in each other's place: exchange ids {a} and {b} in the map."
-    return Correction(Finding(code, sentence, Severity.ERROR), given.config, change.setup.landmark_map)
+    before, after = given.landmark_map.landmarks, change.setup.landmark_map.landmarks
+    moved = sorted(i for i in before if not np.array_equal(before[i].position, after[i].position))
+    finding = Finding(f"map.{change.kind}", _OF_MAP[change.kind].format(*moved), Severity.ERROR)
+    return Correction(finding, given.config, change.setup.landmark_map)
 
 
 def _lens(change: Change, given: Setup) -> Correction:
@@ -394,20 +377,17 @@ def _lens(change: Change, given: Setup) -> Correction:
         return _set(given, "camera.distortion", sentence, "camera", {"k1": round(k1, 3), "k2": round(k2, 3)})
     factor = float(after.K[0, 0] / before.K[0, 0])
     scale = given.config.camera.focal_scale * factor
-    line = f"set expert.camera.focal_scale: {scale:.4f}"
+    line, what = f"set expert.camera.focal_scale: {scale:.4f}", "has the wrong focal length"
     values: dict[str, float] = {"focal_scale": scale}
     if change.kind == "resolution":
         values |= {"cx_px": float(after.K[0, 2]), "cy_px": float(after.K[1, 2])}
         line += f", expert.camera.cx_px: {after.K[0, 2]:.1f} and expert.camera.cy_px: {after.K[1, 2]:.1f}"
         what = "is for another resolution"
-    else:
-        what = "has the wrong focal length"
     sentence = (
         f"The camera's calibration {what}: {before.K[0, 0]:.1f} px given, {after.K[0, 0]:.1f} px seen; {line}, or "
         "better calibrate it."
     )
-    code = "camera.resolution" if change.kind == "resolution" else "camera.focal"
-    return _set(given, code, sentence, "camera", values, factor)
+    return _set(given, f"camera.{change.kind}", sentence, "camera", values, factor)
 
 
 def _mounting(change: Change, given: Setup) -> Correction:
@@ -417,8 +397,7 @@ def _mounting(change: Change, given: Setup) -> Correction:
     shown = ", ".join(f"{round(v, 4) + 0.0:g}" for v in pose)
     line = f"correct the transform, or set recording.sightings_pose: [{shown}]"
     if change.kind == "position":
-        moved = before[:3, :3].T @ (after[:3, 3] - before[:3, 3])
-        x, y, z = moved
+        x, y, z = before[:3, :3].T @ (after[:3, 3] - before[:3, 3])
         sentence = f"The camera sits {z:+.2f} m ahead, {x:+.2f} m right, {y:+.2f} m below its transform: {line}."
     else:
         sentence = f"The camera {_turned(before, after)}: {line}."
@@ -469,10 +448,10 @@ def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
 
 
 def _odometer(change: Change, given: Setup, source: str) -> Correction:
-    values = dict(zip(EXTRAS, change.setup.extras.tolist(), strict=True))
-    mistake = SetupMistake(change.kind, math.exp(values.get(change.kind, 0.0)), change.setup.turned, source)
+    factor = math.exp(change.setup.values.get(change.kind, 0.0))
+    mistake = SetupMistake(change.kind, factor, change.setup.turned, source)
     found = correct(mistake, given.config)
-    value = mistake.factor if change.kind in ("radius", "track") else None
+    value = factor if change.kind in ("radius", "track") else None
     return _set(given, found.code, found.sentence, found.section, found.values, value)
 
 

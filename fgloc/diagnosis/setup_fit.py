@@ -279,14 +279,11 @@ class Motion:
             first: number of the first of these among the unknowns.
         """
         i = self.pairs
-        a, c = poses[i], poses[i + 1]
-        cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
-        dx, dy = c[:, 0] - a[:, 0], c[:, 1] - a[:, 1]
-        x, y = cos * dx + sin * dy, cos * dy - sin * dx
-        turn = se2.wrap_array(c[:, 2] - a[:, 2])
+        moved = se2.between_array(poses[i], poses[i + 1])
+        x, y, turn = moved.T
         rows: list[Rows] = []
         went, sigmas, seconds = self.between(extras)
-        r = np.column_stack([x, y, turn]) - went
+        r = moved - went
         r[:, 2] = se2.wrap_array(r[:, 2])
         J = np.zeros((len(i), 3, 10))
         J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = -1.0
@@ -314,19 +311,14 @@ class Motion:
 
     def between(self, extras: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Wheel motion ``(k, 3)`` between images, its sigmas, and the time between them [s]."""
-        radius, track, pull, late = extras[_WHEELS]
-        noise = self._noise
+        noise, late = self._noise, extras[_WHEELS][3]
         motions, sigmas, spans = [], [], []
         for s in self._stretches:
-            steps = s.wheels @ self._turned_by.T
-            forward = np.exp(radius) * steps[:, :2]
-            turns = np.exp(radius - track) * steps[:, 2] + pull * forward[:, 0]
-            at = s.times - late
-            x, y, yaw = (_at(at, v) for v in _path(forward, turns))
-            c, d = np.cos(yaw[:-1]), np.sin(yaw[:-1])
-            ax, ay, turn = np.diff(x), np.diff(y), np.diff(yaw)
-            motions.append(np.column_stack([c * ax + d * ay, c * ay - d * ax, turn]))
-            dt = np.diff(s.times)
+            forward, turns = self._steps(s, extras)
+            at, dt = s.times - late, np.diff(s.times)
+            path = _along(at, forward, turns)
+            ends = np.diff(path, axis=0)
+            motions.append(np.column_stack([se2.turned(ends[:, :2], -path[:-1, 2]), ends[:, 2]]))
             way = np.diff(_at(at, _summed(np.hypot(forward[:, 0], forward[:, 1]))))
             bend = np.diff(_at(at, _summed(np.abs(turns))))
             q = np.column_stack(
@@ -342,25 +334,24 @@ class Motion:
 
     def path(self, k: int, extras: FloatArray) -> FloatArray:
         """Poses ``(n, 3)`` of the images of a stretch by the wheels, from its first grid point."""
-        radius, track, _, late = extras[_WHEELS]
         s = self._stretches[k]
+        return _along(s.times - extras[_WHEELS][3], *self._steps(s, extras))
+
+    def _steps(self, s: Stretch, extras: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Way ``(g, 2)`` [m] and turn ``(g,)`` [rad] of the wheels in each grid interval."""
+        radius, track, pull, _ = extras[_WHEELS]
         steps = s.wheels @ self._turned_by.T
-        x, y, yaw = _path(np.exp(radius) * steps[:, :2], np.exp(radius - track) * steps[:, 2])
-        return np.column_stack([_at(s.times - late, v) for v in (x, y, yaw)])
+        forward = np.exp(radius) * steps[:, :2]
+        return forward, np.exp(radius - track) * steps[:, 2] + pull * forward[:, 0]
 
     def _by_gyro(self, late: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rotation by the gyro between images ``(k,)``, its derivative by the lateness, and where there is any."""
         turned, slope, has = [], [], []
         for s in self._stretches:
-            k = len(s.times) - 1
-            if s.gyro is None:
-                turned.append(np.zeros(k))
-                slope.append(np.zeros(k))
-            else:
-                angles, at = _summed(s.gyro), s.times - late
-                turned.append(np.diff(_at(at, angles)))
-                slope.append(-np.diff(_at(at, np.append(s.gyro, s.gyro[-1]) / GRID_S)))
-            has.append(np.full(k, s.gyro is not None))
+            gyro, at = np.zeros(len(s.wheels)) if s.gyro is None else s.gyro, s.times - late
+            turned.append(np.diff(_at(at, _summed(gyro))))
+            slope.append(-np.diff(_at(at, np.append(gyro, gyro[-1]) / GRID_S)))
+            has.append(np.full(len(at) - 1, s.gyro is not None))
         return np.concatenate(turned), np.concatenate(slope), np.concatenate(has)
 
 
@@ -405,13 +396,11 @@ def _summed(steps: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _path(forward: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Poses at the grid points from steps ``(g, 2)`` [m] and ``(g,)`` [rad]: x, y, yaw ``(g + 1,)``."""
+def _along(times: FloatArray, forward: FloatArray, turns: FloatArray) -> FloatArray:
+    """Poses ``(n, 3)`` with a continuous yaw at times [s], by steps ``(g, 2)`` [m] and ``(g,)`` [rad] on the grid."""
     yaw = _summed(turns)
-    middle = yaw[:-1] + 0.5 * turns
-    c, s = np.cos(middle), np.sin(middle)
-    x = _summed(c * forward[:, 0] - s * forward[:, 1])
-    return x, _summed(s * forward[:, 0] + c * forward[:, 1]), yaw
+    x, y = se2.turned(forward, yaw[:-1] + 0.5 * turns).T
+    return np.column_stack([_at(times, values) for values in (_summed(x), _summed(y), yaw)])
 
 
 def _at(times: FloatArray, values: FloatArray) -> FloatArray:
@@ -444,6 +433,11 @@ class Setup:
     camera: Camera
     turned: FloatArray = field(default_factory=lambda: np.eye(3))
     extras: FloatArray = field(default_factory=lambda: np.zeros(len(EXTRAS)))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Values of `EXTRAS` by name."""
+        return dict(zip(EXTRAS, self.extras.tolist(), strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -625,8 +619,7 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         n, p = len(poses), len(theta)
         by = step[: 3 * n].reshape(n, 3)
-        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        moved = poses + np.column_stack([c * by[:, 0] - s * by[:, 1], s * by[:, 0] + c * by[:, 1], by[:, 2]])
+        moved = poses + np.column_stack([se2.turned(by[:, :2], poses[:, 2]), by[:, 2]])
         return moved, theta + step[3 * n : 3 * n + p], extras + step[3 * n + p :]
 
     def _fit(
@@ -638,7 +631,7 @@ class Problem:
     ) -> Fit:
         names = (*self._installation.names, *EXTRAS)
         sigmas = np.concatenate([self._installation.sigmas, self._sigmas])
-        found = zip(names, np.concatenate([theta, extras]).tolist(), sigmas.tolist(), strict=True)
+        found = zip(np.concatenate([theta, extras]).tolist(), sigmas.tolist(), strict=True)
         per = state[4] / 8.0
         ids = np.array(self._ids)
         markers = {int(i): float(per[ids == i].mean()) for i in np.unique(ids)}
@@ -647,7 +640,7 @@ class Problem:
             state[3],
             float(np.median(per)),
             poses,
-            {name: (v, s) for name, v, s in found},
+            dict(zip(names, found, strict=True)),
             markers,
             (state[1], state[2]),
         )

@@ -132,7 +132,6 @@ class Signals:
         seen: rows of time, landmark and point ``(3,)``.
         ranges: rows of time, anchor and range [m] by radio.
         spatial: whether the points of ``seen`` have three measured coordinates.
-        widest: largest absolute bearing that was reported [rad]; 0 without bearings.
         images: whether the recording has images, which are not read here.
         odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
         delays: received minus stamped [s], by role.
@@ -147,7 +146,6 @@ class Signals:
     ranges: list[tuple[float, int, float]] = field(default_factory=list)
     odometry: list[tuple[float, ...]] = field(default_factory=list)
     spatial: bool = False
-    widest: float = 0.0
     images: bool = False
     delays: dict[Role, list[float]] = field(default_factory=lambda: defaultdict(list))
 
@@ -306,7 +304,6 @@ class SignalCollector:
                 continue
             distance, bearing = sighting.distance(), getattr(sighting, "bearing_rad", None)
             if distance is not None and bearing is not None:
-                self.found.widest = max(self.found.widest, abs(bearing))
                 x, y = distance * math.cos(bearing), distance * math.sin(bearing)
                 yield (at_s, float(sighting.landmark_id), x, y, 0.0)
 
@@ -360,9 +357,8 @@ _FLOOR_RAD, _FLOOR_M, _FLOOR_SHARE = 0.01, 0.02, 0.01  # what wheels err over a 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativeSighting:
-    """One sighting: time [s], landmark, place in the sensor's axes ``(3,)``, noise of bearing [rad] and range [m]."""
+    """One sighting: landmark, place in the sensor's axes ``(3,)``, noise of bearing [rad] and range [m]."""
 
-    at_s: float
     landmark_id: int
     point: FloatArray
     sigma_rad: float
@@ -381,7 +377,7 @@ class SightingCollector:
         self._sensor = sensor
         self._place = T_base_sensor
 
-    def sightings(self, event: SightingsEvent, at_s: float) -> Iterator[RelativeSighting]:
+    def sightings(self, event: SightingsEvent) -> Iterator[RelativeSighting]:
         """Place and noise of each landmark of a sightings event, in the sensor's axes."""
         if event.in_pixels and self._map is None and self._config.markers.default_size_m is None:
             return
@@ -393,6 +389,5 @@ class SightingCollector:
             point, sigma_rad, sigma_m = found
             distance = float(np.linalg.norm(point))
             floor_m = _FLOOR_M + _FLOOR_SHARE * distance
-            yield RelativeSighting(
-                at_s, m.landmark_id, point, math.hypot(sigma_rad, _FLOOR_RAD), math.hypot(sigma_m, floor_m)
-            )
+            sigmas = math.hypot(sigma_rad, _FLOOR_RAD), math.hypot(sigma_m, floor_m)
+            yield RelativeSighting(m.landmark_id, point, *sigmas)

@@ -89,15 +89,15 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
     """
     times, yaw = poses[:, 0], poses[:, 3]
     rate = fit_rate(path, times, yaw)
-    late = 0.0 if rate is None or rate.share < FOLLOWS else rate.late_s.value
+    by_turn = None if rate is None or rate.share < FOLLOWS else rate.late_s
+    late = 0.0 if by_turn is None else by_turn.value
     start = np.arange(path.times[0], path.times[-1] - window_s, 0.2)
     start = start[path.known(start, start + window_s)]
     start = start[_covered(times, start + late) & _covered(times, start + window_s + late)]
     if len(start) < 40:
         return None
-    speeds = _speed_lag(path, poses, start, window_s)
-    if rate is None or rate.share < FOLLOWS:
-        late = speeds
+    if by_turn is None:
+        late = _speed_lag(path, poses, start)
     fits = {m: _body(path, poses, start, window_s, late, m) for m in (False, True)}
     mirrored = fits[True][1] < 0.5 * fits[False][1]
     if fits[False][0][2] < 0.0 and fits[True][1] < 2.0 * fits[False][1]:  # it went so straight that both fit
@@ -105,14 +105,12 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
     (alpha, lever, turns), misfit, travelled = fits[mirrored]
     if travelled < 0.1:
         return None
-    blocks = np.array_split(np.arange(len(start)), BLOCKS)
     left_out = []
-    for block in blocks:
+    for block in np.array_split(np.arange(len(start)), BLOCKS):
         x = _body(path, poses, np.delete(start, block), window_s, late, mirrored)[0]
         turned = math.remainder(np.angle(x[0]) - np.angle(alpha), math.tau)
         left_out.append((x[2], abs(x[0]), turned, x[1].real, x[1].imag))
     s = jackknife(np.array(left_out)).tolist()
-    lag = Figure(late, rate.late_s.sigma if rate is not None and rate.share >= FOLLOWS else 0.05)
     return BodyFit(
         mirrored,
         Figure(turns, s[0]),
@@ -120,7 +118,7 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
         Figure(float(np.angle(alpha)), s[2]),
         Figure(lever.real, s[3]),
         Figure(lever.imag, s[4]),
-        lag,
+        Figure(late, 0.05 if by_turn is None else by_turn.sigma),
         misfit,
         0.0 if rate is None else rate.share,
     )
@@ -144,7 +142,7 @@ def _at(poses: FloatArray, at: FloatArray) -> tuple[ComplexArray, FloatArray]:
     return x + 1j * y, np.asarray(yaw)
 
 
-def _speed_lag(path: Path, poses: FloatArray, start: FloatArray, window_s: float) -> float:
+def _speed_lag(path: Path, poses: FloatArray, start: FloatArray) -> float:
     """Lag [s] by the distances, for a body whose yaw is no measure of it."""
     way = np.abs(np.diff([np.interp(start + d, path.times, _length(path.poses[:, :2])) for d in (0.0, 0.4)], axis=0)[0])
 
@@ -200,8 +198,8 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
     if section.axes == "ned":
         own[:, 1:] = np.column_stack([own[:, 2], own[:, 1], 0.5 * math.pi - own[:, 3]])
     x, y, turned = se2.inverse((*section.offset_m, section.yaw_offset_rad)).tolist()
-    c, s = np.cos(own[:, 3]), np.sin(own[:, 3])
-    own[:, 1:] += np.column_stack([c * x - s * y, s * x + c * y, np.full(len(own), turned)])
+    own[:, 1:3] += se2.turned(np.array([x, y]), own[:, 3])
+    own[:, 3] += turned
     if not found.signals.true_yaw or float(np.ptp(own[:, 3])) < 1e-3 < 0.1 < float(np.ptp(path.poses[:, 2])):
         found.add("truth.no_yaw", "The truth has no yaw: only positions are compared", severity=Severity.NOTE)
         return None
@@ -318,15 +316,14 @@ def check_body(found: Conventions, fit: BodyFit) -> None:
         found.add("truth.yaw_sign", text, None, fit.turns, warn)
         return
     scale, unit = fit.scale, unit_of(1.0 / fit.scale.value)
-    if unit is None:  # a truth is in a unit
-        if scale.off(1.0, _SCALE):
-            scale_v = round(found.wheels.scale_v * scale.value, 4)
-            text = (
-                f"By the truth the robot moves {scale.value:.3f} ± {scale.sigma:.2g} times as far as its "
-                f"wheels say; if the truth's metres are right, set wheels.scale_v: {scale_v:g}"
-            )
-            found.add("wheels.scale", text, None, scale, _refuted(scale, found.config.wheels.scale_sigma))
-    elif scale.off(1.0, 0.08):
+    if unit is None and scale.off(1.0, _SCALE):
+        scale_v = round(found.wheels.scale_v * scale.value, 4)
+        text = (
+            f"By the truth the robot moves {scale.value:.3f} ± {scale.sigma:.2g} times as far as its "
+            f"wheels say; if the truth's metres are right, set wheels.scale_v: {scale_v:g}"
+        )
+        found.add("wheels.scale", text, None, scale, _refuted(scale, found.config.wheels.scale_sigma))
+    elif unit is not None and scale.off(1.0, 0.08):
         text = (
             f"Distances of the truth are {scale.value:.4g} ± {scale.sigma:.2g} times the wheels' (it is in {unit[1]})"
         )
@@ -338,12 +335,11 @@ def check_body(found: Conventions, fit: BodyFit) -> None:
         found.add("clock.truth", text, found.earlier("truth", late_s.value), late_s, warn)
     if fit.share < 0.3 and fit.yaw.sigma > _KNOWN_YAW:
         return
-    place = [fit.x.value, fit.y.value]
     off_place = [f.off(0.0, 0.03) and f.sigma < 0.05 and fit.share >= 0.3 for f in (fit.x, fit.y)]
     turned = fit.yaw.off(0.0, 0.04)
     if not turned and not any(off_place):
         return
-    kept = [v if off else 0.0 for v, off in zip(place, off_place, strict=True)]
+    kept = [f.value if off else 0.0 for f, off in zip((fit.x, fit.y), off_place, strict=True)]
     T_base_body = se2.compose((*kept, fit.yaw.value if turned else 0.0), (*section.offset_m, section.yaw_offset_rad))
     lines: dict[str, Any] = {}
     what = []
@@ -351,7 +347,7 @@ def check_body(found: Conventions, fit: BodyFit) -> None:
         lines["truth.yaw_offset_rad"] = round(float(T_base_body[2]), 4)
         what.append(f"is turned by {math.degrees(fit.yaw.value):+.1f} ± {math.degrees(fit.yaw.sigma):.1f}°")
     if any(off_place):
-        what.append(f"sits at {place[0]:+z.2f}, {place[1]:+z.2f} m")
+        what.append(f"sits at {fit.x.value:+z.2f}, {fit.y.value:+z.2f} m")
     if any(off_place) or section.offset_m != (0.0, 0.0):
         lines["truth.offset_m"] = [round(v, 3) + 0.0 for v in T_base_body[:2].tolist()]
     text = f"The body that the truth tracks {' and '.join(what)} in the robot's axes"

@@ -15,7 +15,7 @@ from fgloc import se2
 from fgloc.errors import TrajectoryError
 from fgloc.evaluation.metrics import match, matchable
 from fgloc.evaluation.results import Results, read_results
-from fgloc.evaluation.style import BLUE, GREEN, GREY, NORMAL, ORANGE, RED, SKY, WIDTH, broken, legend, plain_label, tidy
+from fgloc.evaluation.style import BLUE, GREEN, GREY, ORANGE, RED, SKY, WIDTH, broken, legend, plain_label, tidy
 from fgloc.files.outputs import read_tum
 from fgloc.recording.truth import lacks_yaw
 from fgloc.types import FloatArray, IntArray, Mode, Trajectory
@@ -165,11 +165,7 @@ def plot_comparison(runs: Sequence[Compared]) -> Figure:
             times = broken(stamps, np.column_stack([(stamps - start) * 1e-9, off]))
             error.plot(*times.T, color=color, ls=dashes, lw=1.0)
     way.set_aspect("equal", adjustable="datalim")
-    way.set_xlabel("x [m]", fontsize=NORMAL)
-    way.set_ylabel("y [m]", fontsize=NORMAL)
-    error.set_xlabel("time [s]", fontsize=NORMAL)
-    error.set_ylabel(f"distance from {'the truth' if truth is not None else 'the first run'} [m]", fontsize=NORMAL)
-    for axes in (way, error):
-        tidy(axes)
+    tidy(way, "x [m]", "y [m]")
+    tidy(error, "time [s]", f"distance from {'the truth' if truth is not None else 'the first run'} [m]")
     legend(figure, handles)
     return figure

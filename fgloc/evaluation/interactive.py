@@ -10,7 +10,16 @@ import numpy as np
 
 from fgloc.evaluation.metrics import Matched
 from fgloc.evaluation.plots import relocated, stands
-from fgloc.evaluation.style import BLUE, MODE_LOOKS, ErrorScale, TimeAxis, after_gaps, mode_runs, seconds
+from fgloc.evaluation.style import (
+    BLUE,
+    MODE_LOOKS,
+    ErrorScale,
+    TimeAxis,
+    after_gaps,
+    mode_runs,
+    position_sigma,
+    seconds,
+)
 from fgloc.results import RunData
 from fgloc.types import Decision, FloatArray, IntArray, Landmark
 
@@ -31,8 +40,8 @@ def interactive(result: RunData, matched: Matched | None) -> dict[str, Any]:
     sigma = None
     if trajectory.covs is not None:
         covs = trajectory.covs[kept]
-        position, yaw = np.sqrt(covs[:, 0, 0] + covs[:, 1, 1]), np.sqrt(covs[:, 2, 2])
-        sigma = {"position_mm": _rounded(1e3 * position, 2), "yaw_deg": _rounded(_DEGREES * yaw, 4)}
+        yaw = np.sqrt(covs[:, 2, 2])
+        sigma = {"position_mm": _rounded(1e3 * position_sigma(covs), 2), "yaw_deg": _rounded(_DEGREES * yaw, 4)}
     return {
         "poses": {
             "t": _rounded(axis.place(times[kept]), 3),

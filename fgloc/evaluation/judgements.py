@@ -363,8 +363,7 @@ def _evidence(rows: Sequence[Decision], worst: Decision, statistic: float) -> st
         return f"{statistic:.1f} s without an accepted sighting{bound}; {count}"
     if not math.isfinite(statistic) or statistic == 0.0:
         return count
-    names = {"wheels": "GLR"}
-    names |= {"lift": f"{worst.reason.replace('_', ' ')}: NIS"}
+    names = {"wheels": "GLR", "lift": f"{worst.reason.replace('_', ' ')}: NIS"}
     name = "2 log likelihood ratio" if worst.reason == "landmark_moved" else names.get(worst.kind, "NIS")
     bound = f", threshold {worst.threshold:.3g}" if math.isfinite(worst.threshold) else ""
     return f"{name} {'up to ' if len(rows) > 1 else ''}{_number(statistic)}{bound}; {count}"

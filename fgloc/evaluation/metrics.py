@@ -44,9 +44,7 @@ class Matched:
     truth: FloatArray  # (n, 3)
     covs: FloatArray | None  # (n, 3, 3) of the estimate
     T_map_truth: FloatArray  # (3,) how the truth was moved; zeros if it was not
-    lever: FloatArray | None = (
-        None  # (n, 2) from the base to the point that a truth without yaw tracks; None: it has one
-    )
+    lever: FloatArray | None = None  # (n, 2) from the base to the point that a truth without yaw tracks; None: with yaw
     ground: FloatArray | None = None  # (n, 3) estimated height, roll and pitch; None: the floor is flat
     true_ground: FloatArray | None = None  # (n, 3); None: not known
     ground_covs: FloatArray | None = None  # (n, 6, 6) of x, y, z, roll, pitch, yaw
@@ -57,9 +55,7 @@ class Matched:
         if self.ground is None or self.true_ground is None:
             return None
         planar, off = self.errors, self.ground - self.true_ground
-        return np.column_stack(
-            [planar[:, :2], off[:, 0], se2.wrap_array(off[:, 1]), se2.wrap_array(off[:, 2]), planar[:, 2]]
-        )
+        return np.column_stack([planar[:, :2], off[:, 0], se2.wrap_array(off[:, 1:]), planar[:, 2]])
 
     @property
     def has_yaw(self) -> bool:
@@ -261,8 +257,9 @@ def all_findings(
     gross = size is not None and size.gross
     judged = [frame] if frame is not None else [] if gross else _optimistic(result, nees_over_3)
     misjudged = [finding for finding in judged if finding.code not in known]
+    sized = [] if size is None or not size.told else [size.finding]
     dropped = [*_dropped(result, rejections, keyframes), *_unused(rejections, keyframes)]
-    return ordered([*_timed(result), *_sized(size), *misjudged, *dropped])
+    return ordered([*_timed(result), *sized, *misjudged, *dropped])
 
 
 def _timed(result: RunData) -> list[Finding]:
@@ -347,13 +344,14 @@ class Size:
         return self.told and abs(math.log(self.scale)) > math.log(_SIZE_GROSS)
 
     @property
-    def sentence(self) -> str:
+    def finding(self) -> Finding:
         """The scale, and where it may come from."""
-        return (
+        text = (
             f"The estimate is {self.scale:.4g} times as large as the truth: scaled, its error would be "
             f"{self.scaled_m:.3g} m (rmse) in place of {self.rigid_m:.3g} m. Distances come from marker sizes, the "
             "map, ranges or wheel radii; or the truth is in another unit."
         )
+        return Finding("truth.size", text, Severity.ERROR if self.gross else Severity.WARNING, value=self.scale)
 
 
 _SIZE_OFF = 0.01  # share; smaller scales are lost in other errors
@@ -371,12 +369,6 @@ def size_of(matched: Matched) -> Size | None:
     scale, turned = abs(common) / spread, truth * common / abs(common)
     left = [float(np.sqrt((abs(estimate - factor * turned) ** 2).mean())) for factor in (1.0, scale)]
     return Size(scale, left[0], left[1] / scale)
-
-
-def _sized(size: Size | None) -> Iterator[Finding]:
-    if size is not None and size.told:
-        severity = Severity.ERROR if size.gross else Severity.WARNING
-        yield Finding("truth.size", size.sentence, severity, value=size.scale)
 
 
 def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
@@ -647,14 +639,14 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
     def against_truth(figure: Callable[[Matched], _Figure | None]) -> _Figure | None:
         return None if matched is None else figure(matched)
 
-    honest: tuple[float | None, dict[str, float] | None] = (None, None)
+    nees_over_dof, covered = None, None
     if matched is not None and matched.covs is not None:
-        fitted = config.truth.align == "se2"
-        errors, covs = in_own_gauge(matched) if fitted else compared(matched)
-        honest = (
-            float(np.mean(nees(errors, covs))) / errors.shape[1],
-            {str(k): coverage(errors, covs, k) for k in (1, 2, 3)},
-        )
+        errors, covs = in_own_gauge(matched) if config.truth.align == "se2" else compared(matched)
+        nees_over_dof = float(np.mean(nees(errors, covs))) / errors.shape[1]
+        covered = {str(k): coverage(errors, covs, k) for k in (1, 2, 3)}
+    rejections = dict(sorted(result.rejections.items()))
+    frame = against_truth(lambda m: _elsewhere(result, config, m) or _turned(config, m))
+    findings = all_findings(result, nees_over_dof, rejections, len(stamps), against_truth(size_of), frame)
     return Metrics(
         duration_s=duration,
         keyframes=len(stamps),
@@ -664,29 +656,17 @@ def compute_metrics(result: RunData, config: Config) -> Metrics:
         yaw_mae_deg=against_truth(yaw_mae_deg),
         end_error_m=against_truth(end_error_m),
         drift_percent=against_truth(drift_percent),
-        nees_over_3=honest[0],
-        coverage=honest[1],
+        nees_over_3=nees_over_dof,
+        coverage=covered,
         ground=against_truth(ground_metrics),
         odometry=None if matched is None else odometry_metrics(result, config, ate_rmse_m(matched)),
         protection=protection_metrics(result, matched),
         real_time_factor=duration / result.wall_s if result.wall_s > 0 else None,
         step_ms=_step_times(result.step_ms),
         factors=dict(sorted(result.counts.items())),
-        rejections=dict(sorted(result.rejections.items())),
+        rejections=rejections,
         installation=_installation(result),
-        findings=tuple(
-            map(
-                FoundFinding.of,
-                all_findings(
-                    result,
-                    honest[0],
-                    dict(sorted(result.rejections.items())),
-                    len(stamps),
-                    against_truth(size_of),
-                    against_truth(lambda m: _elsewhere(result, config, m) or _turned(config, m)),
-                ),
-            )
-        ),
+        findings=tuple(map(FoundFinding.of, findings)),
         judgements=judgements(result),
     )
 
@@ -730,13 +710,11 @@ def beyond_bounds(result: RunData, matched: Matched) -> tuple[NDArray[np.bool_],
     """Two masks ``(n,)`` of the matched poses: those whose error exceeds its bound, and those with an alert."""
     at = np.searchsorted(result.trajectory.stamps_ns, matched.stamps_ns)
     bounds = np.array([result.protections[i].bound for i in at])
-    errors, yaw = matched.errors, matched.estimate[:, 2]
-    c, s = np.cos(yaw), np.sin(yaw)
-    own = np.column_stack([c * errors[:, 0] + s * errors[:, 1], -s * errors[:, 0] + c * errors[:, 1], errors[:, 2]])
+    errors = matched.errors
+    own = np.column_stack([se2.turned(errors[:, :2], -matched.estimate[:, 2]), errors[:, 2]])
     far = matched.distances > np.array([result.protections[i].position_m for i in at])
-    return np.asarray(far | (np.abs(own) > bounds).any(axis=1)), np.array(
-        [result.protections[i].alert for i in at], dtype=np.bool_
-    )
+    alert = np.array([result.protections[i].alert for i in at], dtype=np.bool_)
+    return np.asarray(far | (np.abs(own) > bounds).any(axis=1)), alert
 
 
 def odometry_metrics(result: RunData, config: Config, ate_m: float) -> OdometryMetrics | None:
@@ -763,5 +741,5 @@ def _rms(values: FloatArray) -> float:
 def _step_times(step_ms: FloatArray) -> StepTimes | None:
     if step_ms.size == 0:
         return None
-    median, p95, p99 = np.percentile(step_ms, [50, 95, 99]).tolist()
-    return StepTimes(median=median, p95=p95, p99=p99, max=float(step_ms.max()))
+    median, p95, p99, most = np.percentile(step_ms, [50, 95, 99, 100]).tolist()
+    return StepTimes(median=median, p95=p95, p99=p99, max=most)

@@ -41,7 +41,9 @@ from fgloc.evaluation.style import (
     legend,
     mode_handles,
     mode_runs,
+    over_time,
     plain_label,
+    position_sigma,
     seconds,
     shade_modes,
     tidy,
@@ -51,6 +53,7 @@ from fgloc.types import Decision, FloatArray, IntArray, Landmark, LandmarkMap, T
 
 # --- Trajectory: the map, the way with its times, and below it how large sigma and error are --------------------------
 
+_TIME = "time from the first pose [s]"
 _MAX_ELLIPSES = 60
 _SEEN = 0.06  # of the picture: smaller ellipses are enlarged up to it, or the way's line would cover them
 _FILLED = 0.1  # of the picture: larger ellipses are outlines, or they would cover the map ...
@@ -75,9 +78,7 @@ def plot_trajectory(result: RunData, matched: Matched | None) -> Figure:
     if result.landmarks is not None and len(result.landmarks):
         handles += _draw_landmarks(axes, result.landmarks)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    axes.set_xlabel("x [m]", fontsize=NORMAL)
-    axes.set_ylabel("y [m]", fontsize=NORMAL)
-    tidy(axes)
+    tidy(axes, "x [m]", "y [m]")
     if below:
         handles += _draw_distance(panel[0], result, matched)
     legend(figure, handles)
@@ -260,22 +261,16 @@ def _label_offset(landmark: Landmark) -> tuple[float, float]:
 
 def _draw_distance(axes: Axes, result: RunData, matched: Matched | None) -> list[Artist]:
     """Sigma of the position, and distance from the truth, over time: too small to be seen on the map."""
-    stamps, covs = result.trajectory.stamps_ns, result.trajectory.covs
-    sigma = None if covs is None else np.sqrt(covs[:, 0, 0] + covs[:, 1, 1])
-    scale = ErrorScale.of_distance(result, matched)
+    covs, scale = result.trajectory.covs, ErrorScale.of_distance(result, matched)
     handles: list[Artist] = []
-    if sigma is not None:
-        t, three = broken(stamps, np.column_stack([seconds(result, stamps), 3.0 * scale.unit * sigma])).T
+    if covs is not None:
+        t, three = over_time(result, result.trajectory.stamps_ns, 3.0 * scale.unit * position_sigma(covs))
         axes.fill_between(t, 0.0, three, color=SKY, alpha=0.35, lw=0)
     if matched is not None:
-        columns = np.column_stack([seconds(result, matched.stamps_ns), scale.unit * matched.distances])
-        t, line = broken(matched.stamps_ns, columns).T
-        axes.plot(t, line, color="black", lw=1.0)
+        axes.plot(*over_time(result, matched.stamps_ns, scale.unit * matched.distances), color="black", lw=1.0)
         handles.append(Line2D([], [], color="black", lw=1.0, label="distance from the truth"))
-    tidy(axes)
+    tidy(axes, _TIME, f"{'error, ' if matched is not None else ''}3σ [{scale.name}]")
     scale.apply(axes, symmetric=False)
-    axes.set_ylabel(f"{'error, ' if matched is not None else ''}3σ [{scale.name}]", fontsize=NORMAL)
-    axes.set_xlabel("time from the first pose [s]", fontsize=NORMAL)
     shade_modes(axes, result)
     axis = TimeAxis.of(result, received=False)
     axis.draw_cuts(axes, told=True)
@@ -298,24 +293,20 @@ def plot_error(result: RunData, matched: Matched | None) -> Figure:
         known = None if compared is None else (compared.stamps_ns, np.abs(compared.errors[:, axis]))
         scale = ErrorScale.of(result, None if bands is None else bands[:, axis], known, angle=axis == 2)
         if bands is not None:
-            times = seconds(result, trajectory.stamps_ns)
-            t, band = broken(trajectory.stamps_ns, np.column_stack([times, scale.unit * bands[:, axis]])).T
+            t, band = over_time(result, trajectory.stamps_ns, scale.unit * bands[:, axis])
             axes.fill_between(t, -band, band, color=SKY, alpha=0.25, lw=0)
             axes.plot(t, band, color=SKY, lw=0.8)
             axes.plot(t, -band, color=SKY, lw=0.8)
         if compared is not None:
-            times = seconds(result, compared.stamps_ns)
-            t, error = broken(compared.stamps_ns, np.column_stack([times, scale.unit * compared.errors[:, axis]])).T
-            axes.plot(t, error, color=BLUE, lw=1.0)
+            error = scale.unit * compared.errors[:, axis]
+            axes.plot(*over_time(result, compared.stamps_ns, error), color=BLUE, lw=1.0)
         axes.axhline(0.0, color=GREY, lw=0.6)
-        tidy(axes)
+        tidy(axes, _TIME if axes is rows[-1] else "", f"{name} [{scale.name}]")
         scale.apply(axes, symmetric=True)
-        axes.set_ylabel(f"{name} [{scale.name}]", fontsize=NORMAL)
         shade_modes(axes, result)
         axis_of_time.draw_cuts(axes, told=axis == 0)
     axis_of_time.apply(rows[-1])
     figure.align_ylabels(rows)
-    rows[-1].set_xlabel("time from the first pose [s]", fontsize=NORMAL)
     handles: list[Artist] = [] if bands is None else [Patch(facecolor=SKY, alpha=0.4, label="±3σ of the estimate")]
     if matched is not None:
         handles.insert(0, Line2D([], [], color=BLUE, lw=1.2, label="estimate − truth"))
@@ -345,10 +336,8 @@ def plot_protection(result: RunData, matched: Matched, alert_m: float | None) ->
         axes.axhline(alert_m, color=ORANGE, lw=1.0, ls="--")
         axes.annotate("alert limit", (low, alert_m), fontsize=SMALL, color=ORANGE, va="bottom")
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
-    axes.set_xlabel("distance from the truth [m]", fontsize=NORMAL)
-    axes.set_ylabel("bound on it [m]", fontsize=NORMAL)
     axes.annotate("wrong by more than the bound", (0.97, 0.04), xycoords="axes fraction", ha="right", fontsize=SMALL)
-    tidy(axes)
+    tidy(axes, "distance from the truth [m]", "bound on it [m]")
     return figure
 
 
@@ -405,9 +394,8 @@ def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: Int
         kinds = (False, True) if matched.has_yaw else (False,)
         panels += [(5.0, lambda axes, k=k: _error(axes, result, matched, yaw=k)) for k in kinds]  # type: ignore[misc]
     if not panels:
-        panels.append(
-            (1.0, lambda axes: _activity(axes, span, "keyframes", {"all": _poses(result)}, BLUE, bridge=True))
-        )
+        poses = {"all": seconds(result, result.trajectory.stamps_ns)}
+        panels.append((1.0, lambda axes: _activity(axes, span, "keyframes", poses, BLUE, bridge=True)))
     heights = [height + _HEAD_ROWS for height, _ in panels]
     figure = Figure(figsize=(WIDTH, 0.9 + _ROW_IN * sum(heights)), dpi=DPI, layout="constrained")
     axes_of: list[Axes] = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[
@@ -421,7 +409,7 @@ def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: Int
             axes.axvspan(float(start), float(end), facecolor=SLIP, alpha=0.45, lw=0, zorder=-1)
         axis.draw_cuts(axes, told=axes is axes_of[0])
     axis.apply(axes_of[-1])
-    axes_of[-1].set_xlabel("time from the first pose [s]", fontsize=NORMAL)
+    axes_of[-1].set_xlabel(_TIME, fontsize=NORMAL)
     if handles := _handles(result, motions, known, matched is not None, len(slips) > 0):
         legend(figure, handles)
     return figure
@@ -430,10 +418,6 @@ def plot_timeline(result: RunData, matched: Matched | None = None, slips_ns: Int
 def _of_motion(d: Decision) -> bool:
     """Whether a row is of a motion source, or of a motion that none measured."""
     return is_motion_source(d.kind) or d.kind == "unknown"
-
-
-def _poses(result: RunData) -> FloatArray:
-    return seconds(result, result.trajectory.stamps_ns)
 
 
 def _handles(
@@ -577,15 +561,13 @@ def _error(axes: Axes, result: RunData, matched: Matched, yaw: bool) -> None:
     """Draw the distance from the truth, or the yaw error, with bands of its standard deviation."""
     covs = result.trajectory.covs
     error = np.abs(matched.errors[:, 2]) if yaw else matched.distances
-    sigma = None if covs is None else np.sqrt(covs[:, 2, 2] if yaw else covs[:, 0, 0] + covs[:, 1, 1])
+    sigma = None if covs is None else np.sqrt(covs[:, 2, 2]) if yaw else position_sigma(covs)
     scale = ErrorScale.of(result, None if sigma is None else 3.0 * sigma, (matched.stamps_ns, error), angle=yaw)
     if sigma is not None:
-        stamps = result.trajectory.stamps_ns
-        t, one = broken(stamps, np.column_stack([_poses(result), scale.unit * sigma])).T
+        t, one = over_time(result, result.trajectory.stamps_ns, scale.unit * sigma)
         axes.fill_between(t, 0.0, 3.0 * one, color=SKY, alpha=0.25, lw=0)
         axes.fill_between(t, 0.0, one, color=SKY, alpha=0.4, lw=0)
-    t, line = broken(matched.stamps_ns, np.column_stack([seconds(result, matched.stamps_ns), scale.unit * error])).T
-    axes.plot(t, line, color=GREEN, lw=1.1)
+    axes.plot(*over_time(result, matched.stamps_ns, scale.unit * error), color=GREEN, lw=1.1)
     tidy(axes)
     scale.apply(axes, symmetric=False)
     _title(axes, f"{'yaw' if yaw else 'position'} error and its σ [{scale.name}]")
@@ -639,9 +621,7 @@ def plot_height(result: RunData, matched: Matched | None) -> Figure:
             axes.plot(at, unit * matched.true_ground[:, column], color="black", lw=3.0, alpha=0.35, label="truth")
         axes.fill_between(way, found - band, found + band, color=SKY, alpha=0.3, lw=0, label="3σ")
         axes.plot(way, found, color=BLUE, lw=1.2, label="estimate")
-        axes.set_ylabel(name, fontsize=NORMAL)
-        tidy(axes)
+        tidy(axes, "distance travelled [m]" if axes is rows[-1] else "", name)
     figure.align_ylabels(rows)
     rows[0].legend(loc="upper right", frameon=False, fontsize=NORMAL)
-    rows[-1].set_xlabel("distance travelled [m]", fontsize=NORMAL)
     return figure

@@ -19,7 +19,6 @@ from fgloc.files.outputs import RESULT_FORMAT, read_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, Trajectory
 
-_UPDATE = "update fgloc, or run the recording again"
 _MOST_BYTES = 1 << 30  # of each file
 _REMEDY = "give the folder of a finished run (--out of fgloc smooth or fgloc online)"
 _MODES = {mode.value.lower(): mode for mode in Mode}
@@ -64,7 +63,12 @@ def read_results(folder: Path | str) -> Results:
     if not (folder / "trajectory.tum").is_file():
         raise TrajectoryError(f"{folder}: no trajectory.tum in it; {_REMEDY}")
     provenance = _read_json(folder / "config.json")
-    _check_format(provenance.get("format", 0), folder)
+    written = provenance.get("format", 0)
+    if not isinstance(written, int) or not 0 <= written <= RESULT_FORMAT:
+        raise TrajectoryError(
+            f"{folder}: written by a newer fgloc (format {written!r}; this one reads up to {RESULT_FORMAT}); update "
+            "fgloc, or run the recording again"
+        )
     trajectory = _read_trajectory(folder)
     decisions = _read_steps(folder / "steps.csv")
     named = _named(decisions)
@@ -94,13 +98,6 @@ def read_modes(steps: Path) -> dict[int, Mode]:
 
 def _named(decisions: Iterable[Decision]) -> dict[int, Mode]:
     return {d.stamp_ns: _MODES[d.reason] for d in decisions if d.kind == "mode" and d.reason in _MODES}
-
-
-def _check_format(written: object, folder: Path) -> None:
-    if not isinstance(written, int) or not 0 <= written <= RESULT_FORMAT:
-        raise TrajectoryError(
-            f"{folder}: written by a newer fgloc (format {written!r}; this one reads up to {RESULT_FORMAT}); {_UPDATE}"
-        )
 
 
 def _read_trajectory(folder: Path) -> Trajectory:

@@ -85,6 +85,16 @@ def broken(stamps_ns: NDArray[np.int64], columns: FloatArray) -> FloatArray:
     return np.insert(columns, after_gaps(stamps_ns), np.nan, axis=0)
 
 
+def over_time(result: RunData, stamps_ns: NDArray[np.int64], values: FloatArray) -> FloatArray:
+    """Seconds from the first pose and values ``(2, m)``, with NaN in each silence."""
+    return broken(stamps_ns, np.column_stack([seconds(result, stamps_ns), values])).T
+
+
+def position_sigma(covs: FloatArray) -> FloatArray:
+    """Standard deviation ``(n,)`` [m] of the distance from the true position, by covariances ``(n, 3, 3)``."""
+    return np.asarray(np.sqrt(covs[:, 0, 0] + covs[:, 1, 1]))
+
+
 def mode_runs(result: RunData, mode: Mode) -> list[tuple[int, int]]:
     """First and last index of each stretch in this mode."""
     inside = np.array([m is mode for m in result.modes], dtype=int)
@@ -124,12 +134,16 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, frameon=False, fontsize=NORMAL)
 
 
-def tidy(axes: Axes) -> None:
-    """Draw a grid and remove the frame of the plot."""
+def tidy(axes: Axes, x: str = "", y: str = "") -> None:
+    """Draw a grid, remove the frame of the plot, and name its axes; "": the axis has no name, or another one."""
     axes.grid(color="#e5e5e5", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=SMALL)
+    if x:
+        axes.set_xlabel(x, fontsize=NORMAL)
+    if y:
+        axes.set_ylabel(y, fontsize=NORMAL)
 
 
 # --- Time: a long silence of all poses, as after a jump of the clock, is drawn short ----------------------------------
@@ -285,7 +299,7 @@ class ErrorScale:
     def of_distance(cls, result: RunData, matched: Matched | None) -> ErrorScale:
         """The scale for 3σ of the position and the distance from the truth."""
         covs = result.trajectory.covs
-        band = None if covs is None else 3.0 * np.sqrt(covs[:, 0, 0] + covs[:, 1, 1])
+        band = None if covs is None else 3.0 * position_sigma(covs)
         return cls.of(result, band, None if matched is None else (matched.stamps_ns, matched.distances))
 
     @property

@@ -25,7 +25,7 @@ X, Y = (np.concatenate([[0.0], np.cumsum(0.02 * SPEED * f(YAW))[:-1]]) for f in 
 _AROUND = np.linspace(0.0, math.tau, 9)[:-1]
 BEACONS = np.column_stack([X.mean() + 3.0 * np.cos(_AROUND) + 0.3 * _AROUND, Y.mean() + 2.5 * np.sin(_AROUND)])
 ONE, NONE = Figure(1.0, 0.001), Figure(0.0, 0.001)
-MOUNTING = Mounting("body", ONE, NONE, NONE, NONE, NONE, ONE, 0.05, 500)
+MOUNTING = Mounting("body", ONE, NONE, NONE, NONE, NONE, ONE, 0.05)
 
 
 def path_of(x=X, y=Y, yaw=YAW) -> Path:
@@ -105,7 +105,7 @@ def test_a_sensor_without_noise_still_has_what_wheels_err_by(distance, least):
     known = LandmarkMap({1: Landmark(1, np.array([1.0, 0.0, 0.0]), np.eye(3), 0.0)})
     collector = SightingCollector(config, known, LandmarkSensor(config, known, None, None), np.eye(4))
     event = RangeBearingEvent(1, 1, "/landmarks", "base_link", (RangeBearing(1, distance, 0.3),))
-    (seen,) = collector.sightings(event, 0.0)
+    (seen,) = collector.sightings(event)
     assert np.linalg.norm(seen.point) == pytest.approx(distance)
     assert least <= seen.sigma_m < 2.0 * least
     assert 0.01 <= seen.sigma_rad < 0.02
