@@ -407,7 +407,7 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
     else:
         yield "  # base_frame: base_link  # no usual name is in tf"
     if "frame.unmounted" in {finding.code for finding in seen.info.found}:
-        yield "  # Where the sensor is on the base, which tf does not have: x y z [m] forward, left, up; roll pitch yaw [rad]."
+        yield "  # Place of the sensor on the base, which tf lacks: x y z [m] forward, left, up; roll pitch yaw [rad]."
         yield "  # sightings_pose: [0.1, 0.0, 0.3, 0.0, 0.0, 0.0]  # looks ahead"
     timing = {role: t for t in seen.info.topics for role, topic in seen.info.roles.items() if topic == t.name}
     unstamped = {role for role, t in timing.items() if 2 * t.zero_stamps > t.count}
