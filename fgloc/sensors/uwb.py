@@ -3,7 +3,8 @@
 Found by its entry point, as a sensor of another package is: docs/adding-a-sensor.md goes through this file.
 
 A reading is a `sensor_msgs/Range` whose ``frame_id`` ends in the anchor's number ("anchor_3"). A driver with a message
-of its own needs one more converter. The settings::
+of its own needs one more converter. Topics that differ by a number only (a driver's topic for each anchor) are all read;
+others are named by a pattern (``recording.topics.uwb: /radio/*``). The settings::
 
     uwb:
       anchors: {1: [0.0, 0.0, 2.1], 2: [6.0, 0.0, 2.1], 3: [6.0, 5.0, 2.3]}
@@ -255,7 +256,14 @@ class Uwb:
     needs: ClassVar[str] = "anchors"  # the setting without which it is not built
     Config: ClassVar[type[Section]] = UwbConfig
     streams: ClassVar[tuple[Stream, ...]] = (
-        Stream("uwb", UwbEvent, {"sensor_msgs/msg/Range": from_range}, ("uwb", "uwb/range"), False, check),
+        Stream(
+            "uwb",
+            UwbEvent,
+            {"sensor_msgs/msg/Range": from_range},
+            ("uwb", "uwb/range"),
+            check=check,
+            several=True,
+        ),
     )
     failures: ClassVar[tuple[type[Section], ...]] = (NonLineOfSight,)
     first_settings: ClassVar[FirstSettings] = FirstSettings((UwbEvent,), _first_section)
