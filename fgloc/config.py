@@ -634,9 +634,21 @@ class GateConfig(Section):
         le=1e9,
         description="a jump back larger than this starts a new segment",
     )
+    _units: dict[Role, float] = PrivateAttr(default_factory=dict)
+
     min_marker_side_px: float = constant(
         8.0, "of smaller ones the corners are not fitted well", gt=0, le=1e4, description="a smaller marker is rejected"
     )
+
+    def unit_m(self, role: Role) -> float:
+        """Unit of a role's distances as its messages have them [m]."""
+        return self._units.get(role, 1.0)
+
+    def in_units(self, units: Mapping[Role, float]) -> Self:
+        """Copy for messages whose distances are in these units [m], by role."""
+        other = self.model_copy()
+        other._units = dict(units)
+        return other
 
 
 class KeyframesConfig(Section):

@@ -33,7 +33,7 @@ from fgloc.recording.messages import Decoder
 from fgloc.recording.storage import RawMessage, Storage, lost
 from fgloc.recording.transforms import TF_TOPIC, FrameTree, is_odometry_pair, pair_topic
 from fgloc.sensors import registry
-from fgloc.sensors.base import Converter, When, matrix, nanoseconds, vector, xyz, xyzw
+from fgloc.sensors.base import Converter, UnusableMessageError, When, matrix, nanoseconds, vector, xyz, xyzw
 from fgloc.types import CameraInfoEvent, Event, TransformEvent, TruthEvent
 
 # --- Messages to events, without validation: that is the gate's part --------------------------------------------------
@@ -488,6 +488,7 @@ class Recording:
         self.topics = tuple(replace(topic, role=self.role_of.get(topic.name)) for topic in found.values())
         self._notes = (*of_pairs, *selection.notes, *self._decoder.notes)
         self.undecodable: dict[str, int] = {}
+        self._reasons: dict[str, str] = {}  # why the first message of a topic cannot be used although it is decoded
         self._events = MessageEvents(config)
         self.problems = (*self.problems, *self._lacking_fields())
 
@@ -511,8 +512,9 @@ class Recording:
         """Sentence for each topic with messages that the latest pass of `events` could not decode."""
         counts = {topic.name: topic.count for topic in self.topics}
         of = {topic: max(n, counts.get(topic, 0)) for topic, n in self.undecodable.items()}
+        why = dict.fromkeys(self.undecodable, "decoded") | {t: f"used: {reason}" for t, reason in self._reasons.items()}
         return tuple(
-            lost(f"{topic}: {n} of {of[topic]} messages cannot be decoded.", n / of[topic])
+            lost(f"{topic}: {n} of {of[topic]} messages cannot be {why[topic]}.", n / of[topic])
             for topic, n in self.undecodable.items()
         )
 
@@ -620,8 +622,10 @@ class Recording:
         try:
             content = self._decoder.deserialize(message_type, raw)
             return self._events.of(content, message_type, role, received_ns, topic)
-        except Exception:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
+        except Exception as error:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
             self.undecodable[topic] = self.undecodable.get(topic, 0) + 1
+            if isinstance(error, UnusableMessageError):
+                self._reasons.setdefault(topic, str(error))
             return []
 
     @property

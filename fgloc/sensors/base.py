@@ -215,6 +215,10 @@ class FirstSettings:
     section: Callable[[FirstLook], FirstSection]
 
 
+class UnusableMessageError(ValueError):
+    """A message that is decoded, but lacks what the sensor needs; the sentence goes to the user."""
+
+
 # --- sensors ----------------------------------------------------------------------------------------------------------
 
 When = tuple[int, int, str]

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from fgloc import run
+from fgloc.calibration.first_settings import first_settings
 from fgloc.config import config_of
 from fgloc.diagnosis.mistakes import inspect_all
-from fgloc.errors import RecordingError
+from fgloc.errors import EstimatorError, RecordingError
 from fgloc.recording.reader import TopicInfo, open_recording, select_roles
+from fgloc.sensors.uwb import UwbEvent
 from fgloc.types import Severity
 from fgloc_datasets.bag import BagWriter
 
@@ -18,7 +20,7 @@ ANCHORS = {1: (-4.0, -4.0, 2.0), 2: (8.0, -4.0, 2.0), 3: (8.0, 8.0, 2.0), 4: (-4
 RANGE = "sensor_msgs/msg/Range"
 
 
-def write(folder, topic="/uwb/range", frame="anchor_{}", factor=1.0, beside=(), seconds=20.0):
+def write(folder, topic="/uwb/range", frame="anchor_{}", factor=1.0, beside=(), seconds=14.0):
     """A robot on a curve that bends both ways, its odometry 3 % long, and ranges of four anchors in turn at 10 Hz."""
     rng = np.random.default_rng(2)
     x = y = yaw = 0.0
@@ -93,3 +95,56 @@ def test_anchors_without_any_ranges_are_a_warning(tmp_path):
         (finding,) = (f for f in found if f.code == "sensor.unheard")
         assert finding.severity is Severity.WARNING
         assert "gnss.origin is given, but no topic holds messages of gnss" in finding.text
+
+
+# --- Units ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, 0.001), (100.0, 0.01)])
+def test_ranges_of_another_unit_are_named_and_the_run_is_made_with_it(tmp_path, factor, unit):
+    bag = write(tmp_path, factor=factor)
+    info = inspect_all(bag, None, settings())
+    (finding,) = (f for f in info.found if f.code == "uwb.unit")
+    assert finding.lines == {"uwb.unit_m": str(unit)}
+    assert info.exit_code == 3
+    result = run(bag, None, settings(), "online")
+    assert "uwb.unit" in {f.code for f in result.findings}
+    assert "uwb.range_bound" not in result.rejections
+    settled = settings(unit_m=unit)
+    assert "uwb.unit" not in {f.code for f in inspect_all(bag, None, settled).found}
+    true = run(write(tmp_path / "metres"), None, settings(), "online")
+    np.testing.assert_allclose(run(bag, None, settled, "online").trajectory.poses, true.trajectory.poses, atol=1e-3)
+
+
+def test_the_first_settings_have_the_unit_of_ranges(tmp_path):
+    text = first_settings(write(tmp_path, factor=1000.0)).text
+    assert "unit_m: 0.001" in text
+    assert first_settings(write(tmp_path / "metres")).text.count("unit_m") == 0
+
+
+# --- Anchors ----------------------------------------------------------------------------------------------------------
+
+
+def test_anchors_that_are_heard_and_those_of_the_settings_are_named(tmp_path):
+    bag = write(tmp_path, frame="DW1{}", seconds=8.0)
+    (finding,) = (f for f in inspect_all(bag, None, settings()).found if f.code == "uwb.other_ids")
+    assert finding.severity is Severity.ERROR
+    assert "heard (11, 12, 13, 14) is in uwb.anchors, which has 1, 2, 3, 4" in finding.text
+    with pytest.raises(EstimatorError, match=r"heard \(11, 12, 13, 14\)"):
+        run(bag, None, settings(), "online")
+    some = config_of({"uwb": {"anchors": {1: ANCHORS[1], 12: ANCHORS[2], 13: ANCHORS[3]}}})
+    texts = [f.text for f in inspect_all(bag, None, some).found]
+    assert any("anchors 11, 14 are not used, as uwb.anchors has 1, 12, 13, of which 1 are not" in t for t in texts)
+
+
+def test_messages_that_do_not_say_which_anchor_they_are_of_are_refused_with_the_reason(tmp_path):
+    bag = write(tmp_path, frame="base_link", seconds=4.0)
+    for found in (inspect_all(bag, None, settings()).found, run(bag, None, settings(), "online").findings):
+        assert any("40 of 40 messages cannot be used: frame_id 'base_link' does not end in an" in f.text for f in found)
+
+
+def test_the_topic_tells_the_anchor_where_the_frame_does_not(tmp_path):
+    bag = write(tmp_path, "/uwb/anchor_{}/range", "uwb_tag", seconds=2.0)
+    with open_recording(bag, settings().recording) as recording:
+        heard = [event.anchor for event in recording.events() if isinstance(event, UwbEvent)]
+    assert heard == [k % 4 + 1 for k in range(20)]
