@@ -473,10 +473,18 @@ class TopicsConfig(Section):
         return other
 
     def asking(self, roles: Collection[Role]) -> Self:
-        """Copy that looks for topics of these roles, of `optional_roles`, as for those of all others."""
+        """Copy that looks for topics of these roles, of `optional_roles`, as for those of all others.
+
+        Among several topics that could play one of them, the user has to choose.
+        """
         other = self.model_copy()
         other._asked = frozenset(roles)
         return other
+
+    @property
+    def asked(self) -> frozenset[Role]:
+        """Roles of sensors by entry point that the settings ask for."""
+        return self._asked
 
 
 class OdometryTopic(Section):
@@ -626,9 +634,21 @@ class GateConfig(Section):
         le=1e9,
         description="a jump back larger than this starts a new segment",
     )
+    _units: dict[Role, float] = PrivateAttr(default_factory=dict)
+
     min_marker_side_px: float = constant(
         8.0, "of smaller ones the corners are not fitted well", gt=0, le=1e4, description="a smaller marker is rejected"
     )
+
+    def unit_m(self, role: Role) -> float:
+        """Unit of a role's distances as its messages have them [m]."""
+        return self._units.get(role, 1.0)
+
+    def in_units(self, units: Mapping[Role, float]) -> Self:
+        """Copy for messages whose distances are in these units [m], by role."""
+        other = self.model_copy()
+        other._units = dict(units)
+        return other
 
 
 class KeyframesConfig(Section):
@@ -793,8 +813,9 @@ class Config(SensorSections):
         if self.cameras and self.camera != CameraConfig():
             raise ValueError("camera is one camera and cameras are several; give one of the two sections")
         recording = _with_topics(self.recording, self.cameras)
-        settings = ((role, getattr(self, name, None), key) for role, (name, key) in optional_roles().items())
-        if asked := {role for role, section, key in settings if getattr(section, key, None)}:
+        needed = ((s, getattr(self, s.name, None), getattr(s, "needs", "")) for s in outside_sensors())
+        asking = [sensor for sensor, section, key in needed if key and getattr(section, key, None)]
+        if asked := {stream.role for sensor in asking for stream in sensor.streams}:
             recording = recording.model_copy(update={"topics": recording.topics.asking(asked)})
         self.__dict__["recording"] = recording
         return self

@@ -20,7 +20,7 @@ from fgloc.errors import ConfigError, EstimatorError
 from fgloc.evaluation.report import write_results
 from fgloc.graph.contradictions import Contradiction
 from fgloc.instrumentation import one_blas_thread, working
-from fgloc.recording.info import unread_map, unused_positions
+from fgloc.recording.info import unheard, unread_map, unused_positions
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.replay import Progress, Replay, RunMode, RunOptions, SmoothedRun, smooth_run
 from fgloc.results import RunData
@@ -76,6 +76,7 @@ class Outcome:
             ),
             *wrong.findings,
             *note("positions.unused", unused_positions(recording, parts.config), Severity.WARNING),
+            *note("sensor.unheard", unheard(recording, parts.config), Severity.WARNING),
             *note("floor.uneven", map(sentence, parts.diagnosis.mistakes), Severity.ERROR),
             *note("sightings.unused", map(sentence, unused), Severity.ERROR),
             *note("motion.model", map(sentence, parts.localizer.motion.mistakes), Severity.ERROR),

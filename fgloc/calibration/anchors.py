@@ -29,6 +29,7 @@ from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate, installation_of
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
+from fgloc.intake.validation import reported_bounds
 from fgloc.recording.reader import open_recording
 from fgloc.replay import Progress
 from fgloc.sensors.base import with_values
@@ -80,12 +81,12 @@ def _drive(bag: Path, config: Config, progress: Progress | None) -> _Drive:
     rejected: Counter[str] = Counter()
     with open_recording(bag, config.recording) as recording:
         parts = assemble(recording, None, config, keep_all=True)
-        start_ns = recording.span_ns[0]
+        start_ns, bounds = recording.span_ns[0], reported_bounds(config)
         for event in recording.events():
             if progress is not None:
                 progress((event.received_ns - start_ns) * 1e-9, recording.duration_s)
             if isinstance(event, UwbEvent):
-                checked = check(event, config.gate)
+                checked = check(event, bounds)
                 if isinstance(checked, str):
                     rejected[checked] += 1
                 else:

@@ -16,7 +16,7 @@ from fgloc.diagnosis import gyro, landmarks, odometry, truth
 from fgloc.diagnosis.comparison import WHEELS, Conventions
 from fgloc.diagnosis.landmark_fits import Mounting, fit_sightings
 from fgloc.diagnosis.pairs import LAG_SIGMAS, LATE_S, TELLS, Figure, RateFit, fit_rate, varied, weighted
-from fgloc.diagnosis.ranges import check_ranges
+from fgloc.diagnosis.ranges import check_radio, check_ranges
 from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.diagnosis.steering import check_steering
 from fgloc.diagnosis.truth import BodyFit
@@ -37,6 +37,7 @@ def conventions(
 ) -> Conventions:
     """Compare all pairs of signals of a recording, read as configured; the arguments are those of `Conventions`."""
     found = Conventions(config, signals, T_base_sensor, imu_up, landmark_map)
+    check_radio(found)
     path = odometry.check_odometry(found)
     found.wheels = found.config.wheels
     if path is None or path.length_m < _LEAST_PATH_M:

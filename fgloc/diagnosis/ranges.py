@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.pairs import MAD, ComplexArray, Figure, jackknife
 from fgloc.diagnosis.signals import GRID_S, Path, in_order
+from fgloc.sensors.uwb import UNITS, numbers, usual_unit
 from fgloc.types import FloatArray, Severity
 
 _MOST_STRETCHES, _FEWEST_STRETCHES = 12, 4
@@ -224,6 +225,53 @@ def _laid(z: ComplexArray, s: _Stretch) -> FloatArray:
 
 
 # --- Findings ---------------------------------------------------------------------------------------------------------
+
+
+_MARGIN = 1.2  # of the bound of ranges over the farthest
+_MISSES = 0.7  # times what two ranges have to be together, at least, to reach from one anchor to the other
+_OF_ANCHOR = 5  # ranges of an anchor whose median counts
+
+
+def check_radio(found: Conventions) -> None:
+    """Name ranges of another unit, and anchors none of which the settings have."""
+    section: Any = getattr(found.config, "uwb", None)
+    rows = found.signals.ranges
+    if section is None or len(rows) < _FEWEST:
+        return
+    heard, bound = sorted({int(row[1]) for row in rows}), found.config.gate.max_range
+    ranges = np.array([row[2] for row in rows])
+    low, middle, high = np.percentile(ranges, [1.0, 50.0, 99.0])
+    if middle > bound and (unit := _unit(section, rows, bound)) is not None:
+        text = (
+            f"Half of the ranges are beyond the {bound:g} m of expert.gate.max_range ({low:.4g} to {high:.4g} m): they "
+            f"are in {UNITS[unit]}"
+        )
+        far = {"gate.max_range": float(math.ceil(_MARGIN * high * unit))} if high * unit > bound else {}
+        found.add("uwb.unit", text, {"uwb.unit_m": float(f"{section.unit_m * unit:.6g}")} | far)
+        found.signals = replace(found.signals, ranges=[(t, i, r * unit) for t, i, r in rows])
+    if section.anchors and not section.anchors.keys() & set(heard):
+        text = (
+            f"None of the anchors that are heard ({numbers(heard)}) is in uwb.anchors, which has "
+            f"{numbers(section.anchors)}: no range is used. Give places by the numbers that the messages have (the "
+            "figures at the end of frame_id, else in the topic's name)"
+        )
+        found.add("uwb.other_ids", text)
+
+
+def _unit(section: Any, rows: Sequence[tuple[float, ...]], bound: float) -> float | None:
+    """Unit [m] that brings ranges within the bound and to anchors; None: no usual one, or it is not sure."""
+    ranges = [row[2] for row in rows]
+    fitting = [unit for unit in UNITS if float(np.median(ranges)) * unit <= bound]
+    middles = {}
+    for number, place in section.anchors.items():
+        own = [row[2] for row in rows if int(row[1]) == number]
+        if len(own) >= _OF_ANCHOR:
+            middles[number] = (np.array(place), float(np.median(own)))
+    pairs = [(a, b) for k, a in enumerate(middles.values()) for b in list(middles.values())[k + 1 :]]
+    if pairs:  # two ranges together reach from one anchor to the other
+        short = [min(u * (r + s) / max(float(math.dist(p, q)), 1e-9) for (p, r), (q, s) in pairs) for u in fitting]
+        return next((u for u, share in zip(fitting, short, strict=True) if share > _MISSES), None)
+    return usual_unit(ranges, bound)
 
 
 def check_ranges(found: Conventions, path: Path) -> Path:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fgloc.config import Config, GateConfig, camera_role
+from fgloc.extensions import outside_sensors
 from fgloc.sensors import registry
 from fgloc.sensors.base import Stream
 from fgloc.sensors.checks import EMPTIED, Changes, FieldChecks
@@ -105,7 +106,14 @@ def reported_bounds(config: Config) -> GateConfig:
         "max_wheel_rate": gate.max_wheel_rate if config.wheels.in_radians else math.inf,
         "max_position": gate.max_position / min(config.truth.scale, 1.0),
     }
-    return gate.model_copy(update=bounds)
+    sections = ((sensor, getattr(config, sensor.name, None)) for sensor in outside_sensors())
+    units = {
+        stream.role: section.unit_m
+        for sensor, section in sections
+        if section is not None and hasattr(section, "unit_m")
+        for stream in sensor.streams
+    }
+    return gate.model_copy(update=bounds).in_units(units)
 
 
 class EventValidator:

@@ -6,6 +6,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
+from fnmatch import fnmatchcase
 
 import numpy as np
 
@@ -120,9 +121,10 @@ class LiveFacts:
         if role is None:
             return True
         given = self._given(role)
-        if given == "none" or given not in (None, event.topic):
+        several = registry.of_several(role)
+        if given == "none" or (given not in (None, event.topic) and not (several and fnmatchcase(event.topic, given))):
             return False
-        return self._topics.setdefault(role, event.topic) == event.topic
+        return self._topics.setdefault(role, event.topic) == event.topic or several
 
     def is_configured(self, event: Event) -> bool:
         """Whether the configuration names the topic that plays the event's role, or none."""

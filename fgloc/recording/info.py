@@ -343,6 +343,7 @@ def inspect_recording(
             *note("recording", findings, Severity.WARNING),
             *_roles(recording, config, checks, child_frame),
             *note("recording", early_clocks(reports), Severity.WARNING),
+            *note("sensor.unheard", unheard(recording, config), Severity.WARNING),
             *note("recording.unused", _unused(recording, config), Severity.NOTE),
         ),
         notes=recording.notes,
@@ -482,6 +483,22 @@ def unused_positions(recording: Recording, config: Config) -> list[str]:
     ]
 
 
+def unheard(recording: Recording, config: Config) -> list[str]:
+    """Sentences on sensors that the settings ask for, and that no topic of the recording has messages of."""
+    topics, found = config.recording.topics, []
+    for sensor in outside_sensors():
+        roles = [stream.role for stream in sensor.streams if stream.role in topics.asked]
+        if not roles or recording.problems or any(r in recording.roles or topics.given(r) == "none" for r in roles):
+            continue
+        kinds = " or ".join(kind.replace("/msg/", "/") for stream in sensor.streams for kind in stream.converters)
+        found.append(
+            f"{sensor.name}.{sensor.needs} is given, but no topic holds messages of {sensor.name} (expected {kinds}): "
+            f"record them, or remove {sensor.name}.{sensor.needs}; recording.topics.{roles[0]}: none says that there "
+            "are none."
+        )
+    return found
+
+
 def _unused(recording: Recording, config: Config) -> list[str]:
     """Sentences on topics that hold the robot's position, and that nothing reads, or nothing as it is configured."""
     lacking, found = _lacking(config), []
@@ -497,7 +514,10 @@ def _unused(recording: Recording, config: Config) -> list[str]:
     for t in recording.topics:
         kind = t.message_type.rpartition("/")[2]
         if t.count and t.role in lacking:
-            found.append(f"{t.name} ({t.message_type}) is not used: give {lacking[t.role]} in robot.yaml.")
+            same = [other.name for other in recording.topics if other.role == t.role and other.count]
+            if t.name == same[0]:
+                what = f"{', '.join(same)} ({t.message_type}) {'is' if len(same) == 1 else 'are'}"
+                found.append(f"{what} not used: give {lacking[t.role]} in robot.yaml.")
         elif t.count and t.role is None and (one := optional.get(t.message_type)) is not None:
             why = f"{one.purpose}, give {lacking[one.name]}"
             found.append(f"{t.name} ({t.message_type}) is not used: {why} in robot.yaml.")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import islice
 from operator import attrgetter
@@ -32,7 +33,7 @@ from fgloc.recording.messages import Decoder
 from fgloc.recording.storage import RawMessage, Storage, lost
 from fgloc.recording.transforms import TF_TOPIC, FrameTree, is_odometry_pair, pair_topic
 from fgloc.sensors import registry
-from fgloc.sensors.base import Converter, When, matrix, nanoseconds, vector, xyz, xyzw
+from fgloc.sensors.base import Converter, UnusableMessageError, When, matrix, nanoseconds, vector, xyz, xyzw
 from fgloc.types import CameraInfoEvent, Event, TransformEvent, TruthEvent
 
 # --- Messages to events, without validation: that is the gate's part --------------------------------------------------
@@ -171,9 +172,10 @@ class TopicInfo:
 class Selection:
     """Outcome of the selection."""
 
-    roles: Mapping[Role, str]
+    roles: Mapping[Role, str]  # of several topics the first
     notes: tuple[str, ...]  # what was taken for what, where that was not obvious
     problems: tuple[str, ...]  # ambiguities, and configured topics that do not fit
+    also: Mapping[str, Role] = field(default_factory=dict)  # further topics, of roles that may have several
 
 
 def select_roles(
@@ -187,13 +189,13 @@ def select_roles(
         beside: topics of the odometries beside the wheels, by role.
         growing: a configured topic that is not there may still come: that is no problem.
     """
-    roles, problems, notes = _given_roles(topics, config, beside or {}, growing)
+    roles, also, problems, notes = _given_roles(topics, config, beside or {}, growing)
     filled = [topic for topic in topics if topic.count > 0]
     names = (*role_names(), *config.of_cameras)
     for role in sorted(names, key=_by_dependence):
         if config.given(role) is not None:
             continue
-        taken = (*roles.values(), *config.of_joints)
+        taken = (*roles.values(), *also, *config.of_joints)
         fitting = [topic for topic in filled if _fits(role, topic) and topic.name not in taken]
         whole = [topic.name for topic in fitting if topic.message_type not in (_TRANSFORM, POINT, _TWIST)]
         candidates = whole or [topic.name for topic in fitting]
@@ -208,19 +210,24 @@ def select_roles(
             roles[role] = chosen
             if why:
                 notes.append(f"{chosen} is taken as {role}: {why}.")
-        elif candidates and role not in BUILT_IN_ROLES:  # nobody may have asked for the sensor
+        elif registry.of_several(role) and len(candidates) > 1 and len({*map(_unnumbered, candidates)}) == 1:
+            roles[role], *others = sorted(candidates)
+            also |= dict.fromkeys(others, role)
+            notes.append(f"{', '.join(sorted(candidates))} are all taken as {role}: they differ by a number only.")
+        elif candidates and role not in BUILT_IN_ROLES and role not in config.asked:  # nobody asked for the sensor
             notes.append(
                 f"No {role}: {', '.join(candidates)} could be it; choose one with recording.topics.{role}, or none."
             )
         elif candidates:
             none = f"none (recording.topics.{role}: none)"
             none += "; list others in recording.odometries to use them too" if role == "odometry" else ""
+            none += "; several by a pattern: /uwb/range_*" if registry.of_several(role) else ""
             problems.append(
                 f"{len(candidates)} topics could be the {role}: {', '.join(candidates)}; choose one in the "
                 f"configuration (recording.topics.{role}: {candidates[0]}), or {none}"
             )
         else:
-            free = [t for t in filled if t.name not in (*roles.values(), *config.of_joints)]
+            free = [t for t in filled if t.name not in (*roles.values(), *also, *config.of_joints)]
             notes.append(_unnamed(role, free))
     notes.append(_one_of_images_and_sightings(roles, config))
     told = [topic.name for topic in filled if topic.message_type in converters_of("truth")]
@@ -228,21 +235,28 @@ def select_roles(
     if own:
         notes.append(f"{', '.join(own)}: the output of a run of fgloc, which is not read.")
     notes += [_empty(role, topics) for role in role_names() if role not in roles and config.given(role) is None]
-    return Selection(roles, tuple(note for note in notes if note), tuple(problems))
+    return Selection(roles, tuple(note for note in notes if note), tuple(problems), also)
 
 
 def _given_roles(
     topics: Sequence[TopicInfo], config: TopicsConfig, beside: Mapping[Role, str], growing: bool
-) -> tuple[dict[Role, str], list[str], list[str]]:
-    """Roles that the user gave, what is wrong with them, and the cameras that have nothing in the recording."""
+) -> tuple[dict[Role, str], dict[str, Role], list[str], list[str]]:
+    """Roles that the user gave, further topics of them, what is wrong, and cameras without anything there."""
     roles: dict[Role, str] = {}
+    also: dict[str, Role] = {}
     problems: list[str] = []
     notes: list[str] = []
     there, filled = {topic.name for topic in topics}, {topic.name for topic in topics if topic.count > 0}
     seeing = [t for role, t in config.of_cameras.items() if base_role(role) != "camera_info" and t in filled]
     own = ((role, config.given(role)) for role in (*role_names(), *config.of_cameras))
     for role, given in (*own, *beside.items()):
-        if given is None or given == "none" or (growing and given not in there):
+        if given is None or given == "none":
+            continue
+        if "*" in given and registry.of_several(role):
+            fitting = [t for t in topics if t.message_type in converters_of(role) and t.count > 0]
+            given, *others = sorted(t.name for t in fitting if fnmatchcase(t.name, given)) or [given]
+            also |= dict.fromkeys(others, role)
+        if growing and given not in there:
             continue
         if role in config.of_cameras and given not in filled and seeing:
             notes.append(f"{topic_key(role)}: {given} has no messages; the run goes on without it.")
@@ -262,7 +276,12 @@ def _given_roles(
         problems.append(
             "no topic of the configuration fits: if it is another robot's, `fgloc init BAG` writes this one's"
         )
-    return roles, problems, notes
+    return roles, also, problems, notes
+
+
+def _unnumbered(topic: str) -> str:
+    """Name of a topic without what numbers it among others: its words with a figure in them."""
+    return re.sub(r"[A-Za-z0-9]*\d[A-Za-z0-9]*", "#", topic)
 
 
 def is_derived(topic: str) -> bool:
@@ -431,7 +450,8 @@ class Recording:
         path: as given.
         kind: "ros1", "sqlite3" or "mcap".
         topics: all topics, with the role that each plays.
-        roles: selected topic of each role.
+        roles: selected topic of each role, of several the first.
+        role_of: role of each selected topic.
         problems: why no topic could be selected for a role; `open_recording` raises them.
         undecodable: messages that the latest pass of `events` could not decode, by topic.
     """
@@ -462,11 +482,13 @@ class Recording:
         self.problems = selection.problems
         self.role_of: Mapping[str, Role] = {
             **{topic: role for role, topic in selection.roles.items()},
+            **selection.also,
             **dict.fromkeys(config.topics.of_joints, "joints"),
         }
         self.topics = tuple(replace(topic, role=self.role_of.get(topic.name)) for topic in found.values())
         self._notes = (*of_pairs, *selection.notes, *self._decoder.notes)
         self.undecodable: dict[str, int] = {}
+        self._reasons: dict[str, str] = {}  # why the first message of a topic cannot be used although it is decoded
         self._events = MessageEvents(config)
         self.problems = (*self.problems, *self._lacking_fields())
 
@@ -490,8 +512,9 @@ class Recording:
         """Sentence for each topic with messages that the latest pass of `events` could not decode."""
         counts = {topic.name: topic.count for topic in self.topics}
         of = {topic: max(n, counts.get(topic, 0)) for topic, n in self.undecodable.items()}
+        why = dict.fromkeys(self.undecodable, "decoded") | {t: f"used: {reason}" for t, reason in self._reasons.items()}
         return tuple(
-            lost(f"{topic}: {n} of {of[topic]} messages cannot be decoded.", n / of[topic])
+            lost(f"{topic}: {n} of {of[topic]} messages cannot be {why[topic]}.", n / of[topic])
             for topic, n in self.undecodable.items()
         )
 
@@ -599,8 +622,10 @@ class Recording:
         try:
             content = self._decoder.deserialize(message_type, raw)
             return self._events.of(content, message_type, role, received_ns, topic)
-        except Exception:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
+        except Exception as error:  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
             self.undecodable[topic] = self.undecodable.get(topic, 0) + 1
+            if isinstance(error, UnusableMessageError):
+                self._reasons.setdefault(topic, str(error))
             return []
 
     @property

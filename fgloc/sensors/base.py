@@ -215,6 +215,10 @@ class FirstSettings:
     section: Callable[[FirstLook], FirstSection]
 
 
+class UnusableMessageError(ValueError):
+    """A message that is decoded, but lacks what the sensor needs; the sentence goes to the user."""
+
+
 # --- sensors ----------------------------------------------------------------------------------------------------------
 
 When = tuple[int, int, str]
@@ -243,6 +247,7 @@ class Stream(NamedTuple):
         check: see `Check`. Stamps are checked for every sensor alike.
         validator: takes the place of the check where a run's counts and notes are needed.
         findings: what looks wrong with the topic of a recording, for ``fgloc info``.
+        several: whether each message says what it is of, so that the messages may be on a topic for each.
     """
 
     role: str
@@ -253,6 +258,7 @@ class Stream(NamedTuple):
     check: Check | None = None
     validator: Validator | None = None
     findings: Callable[[], Collector] = TimingOnly
+    several: bool = False
 
     def validate(self, checks: FieldChecks) -> Callable[[Any], Event | str]:
         """Return the function that checks the events of one run."""

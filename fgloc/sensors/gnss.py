@@ -17,6 +17,7 @@ Source of the transformation: NIMA TR8350.2, Department of Defense World Geodeti
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -26,9 +27,10 @@ from pydantic import Field
 
 from fgloc.config import Config, GateConfig, Section
 from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, Stream, When
+from fgloc.sensors.checks import Table
 from fgloc.sensors.failures import EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
-from fgloc.types import Event, FloatArray, SensorEvent
+from fgloc.types import Event, FloatArray, Grave, SensorEvent
 
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # of the ellipsoid of WGS 84
 _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
@@ -171,6 +173,49 @@ class Multipath(EventFailure):
 _FIRST = 10  # positions whose median is proposed for the origin
 
 
+_UNITS = {"in radians": math.degrees(1.0), "degrees times 1e7": 1e-7}  # of messages that are not in degrees, in degrees
+
+
+def _other_form(places: FloatArray) -> str:
+    """Form that latitudes and longitudes ``(n, 2)`` seem to have, which is not degrees; empty: they may be degrees."""
+    latitude, longitude = np.median(np.abs(places), axis=0)
+    if not max(latitude, longitude) > 0.0:
+        return ""
+    if latitude <= 0.5 * math.pi and longitude <= math.pi:  # in degrees this would be open sea off Africa
+        return "in radians"
+    if max(latitude, longitude) > 1e4 and latitude <= 90e7 and longitude <= 360e7:
+        return "degrees times 1e7"
+    return "exchanged" if 90.0 < latitude <= 360.0 and longitude <= 90.0 else ""
+
+
+def _away_m(place: FloatArray, origin: tuple[float, float, float]) -> float:
+    """Distance [m] from the origin of a place ``(2,)`` of latitude and longitude, at its altitude."""
+    latitude, longitude = place.tolist()
+    return math.hypot(*east_north(latitude, longitude, origin[2], origin))
+
+
+def _far_off(places: FloatArray, origin: tuple[float, float, float]) -> str:
+    """Sentence part on places ``(n, 2)`` most of which are far from the origin, and why; empty: they are not."""
+    off = [_away_m(place, origin) for place in places]
+    off_m = float(np.median(off)) if off else 0.0
+    if off_m <= _FARTHEST_M:
+        return ""
+    middle = np.median(places, axis=0)
+    ways = {"exchanged": middle[::-1]} | {form: middle * factor for form, factor in _UNITS.items()}
+    near = [form for form, place in ways.items() if _away_m(place, origin) <= _FARTHEST_M]
+    text = f"{off_m / 1e3:.4g} km from gnss.origin, expected at most {_FARTHEST_M / 1e3:g} km, and are not used"
+    if near:
+        return f"{text}: {_form(near[0])}"
+    return f"{text}: correct gnss.origin (latitude first), which they would have at {middle[0]:.6f}, {middle[1]:.6f}"
+
+
+def _form(form: str) -> str:
+    """Sentence part on the form of positions, with the remedy."""
+    if form == "exchanged":
+        return "latitude and longitude seem to be exchanged; the driver has to publish degrees, latitude in latitude"
+    return f"latitude and longitude seem to be {form}; the driver has to publish degrees"
+
+
 def _origin(fixes: Sequence[GnssEvent]) -> str:
     """Median of some positions, as `gnss.origin` has it."""
     about = np.median([(e.latitude, e.longitude, e.altitude) for e in fixes], axis=0)
@@ -182,13 +227,19 @@ def _first_section(look: FirstLook) -> FirstSection:
     """A proposal for the origin, for the user to take: how far positions may be trusted is not told by a recording."""
     passed = (check(event, GateConfig()) for event in look.of(GnssEvent))
     fixes = [event for event in passed if isinstance(event, GnssEvent)]
+    events = look.of(GnssEvent)
+    places = np.array([(e.latitude, e.longitude) for e in events if math.isfinite(e.latitude + e.longitude)])
+    form = _other_form(places.reshape(-1, 2)) if len(places) else ""
+    if form or (events and not fixes):
+        why = _form(form) if form else "no message holds a position (no fix, NaN, or beyond what degrees may be)"
+        return FirstSection((), (f"the positions on {events[0].topic}, which cannot be used: {why}",))
     if not fixes:
         return FirstSection()
     lines = (
         "gnss:",
         "  # Positions are used once the origin of the map is given; these are the first ones. Receivers err alike for",
         "  # a minute, by more than they say: sigma_scale 5 is a cautious start.",
-        f"  # origin: {_origin(fixes[:_FIRST])}  # latitude, longitude [°], altitude [m]",
+        f"  # origin: {_origin(fixes[:_FIRST])}  # latitude, longitude [°], altitude [m]: is the robot there?",
         "  # sigma_scale: 5.0",
         "  # antenna: [0.0, 0.0]  # x y [m] in the base frame; else tf, else the base",
     )
@@ -197,12 +248,22 @@ def _first_section(look: FirstLook) -> FirstSection:
     )
 
 
+_MOST_PLACES = 500  # of a topic, evenly chosen, whose distances are computed
+_REFUSED = {
+    "non_finite": "hold NaN or infinity in latitude, longitude or their covariance",
+    "position_bound": "have a latitude beyond 90° or a longitude beyond 360°",
+    "indefinite_cov": "have a covariance with a variance of 0 or less",
+}  # by reason
+
+
 class GnssChecks:
-    """Checks of a topic of positions: messages without a fix, and an origin where none is given."""
+    """Checks of a topic of positions: those that cannot be used, where they are, and an origin where none is given."""
 
     def __init__(self) -> None:
         self._count = 0
         self._unfixed: list[int] = []  # places among the messages
+        self._refused: Counter[str] = Counter()
+        self._places = Table(2)
         self._first: list[GnssEvent] = []
 
     def add(self, event: Event) -> None:
@@ -211,8 +272,12 @@ class GnssChecks:
         checked = check(event, GateConfig())
         if checked == "no_fix":
             self._unfixed.append(self._count)
-        elif isinstance(checked, GnssEvent) and len(self._first) < _FIRST:
+        elif isinstance(checked, str):
+            self._refused[checked] += 1
+        elif len(self._first) < _FIRST:
             self._first.append(checked)
+        if event.fixed and math.isfinite(event.latitude + event.longitude):
+            self._places.add(event.latitude, event.longitude)
         self._count += 1
 
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
@@ -225,7 +290,16 @@ class GnssChecks:
                 f"and longitude are 0) and are not used; the first and the last at {at} s."
             )
         section: GnssConfig = getattr(config, Gnss.name, GnssConfig())
-        if section.origin is None and self._first:
+        places = self._places.array()
+        form = _other_form(places) if len(places) else ""
+        for reason, n in self._refused.items():
+            found.append(f"{topic}: {n} of {self._count} messages {_REFUSED[reason]} and will be rejected.")
+        if section.origin is not None and not self._refused["position_bound"] and len(places):
+            far = _far_off(places[:: -(-len(places) // _MOST_PLACES)], section.origin)
+            found += [f"{topic}: its positions are {far}."] if far else []
+        elif form:
+            found.append(f"{topic}: {_form(form)}.")
+        if section.origin is None and self._first and not form:
             found.append(
                 f"{topic}: to use its positions, set gnss.origin: {_origin(self._first)} (its first ones) if the map "
                 "begins there."
@@ -261,7 +335,8 @@ class Gnss:
         self._antennas: dict[str, FloatArray] = {}
         c, s = math.cos(self._config.yaw_rad), math.sin(self._config.yaw_rad)
         self._R_map_enu = np.array([[c, s], [-s, c]])
-        self._far = 0
+        self._far = Table(2)  # latitude and longitude of positions far from the origin
+        self._used = False
         self._notes: dict[str, None] = {}  # an ordered set
 
     @classmethod
@@ -276,8 +351,9 @@ class Gnss:
         altitude = event.altitude if math.isfinite(event.altitude) else config.origin[2]
         local = east_north(event.latitude, event.longitude, altitude, config.origin)
         if math.hypot(*local) > _FARTHEST_M:
-            self._far += 1
+            self._far.add(event.latitude, event.longitude)
             return
+        self._used = True
         cov = config.sigma_scale**2 * event.cov if event.cov.any() else np.eye(2) * config.sigma_m**2
         yield GnssPosition(
             source="gnss",
@@ -302,8 +378,8 @@ class Gnss:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is missing or out of reach."""
-        far = (
-            f"{self._far} GNSS position(s) lie more than {_FARTHEST_M / 1e3:g} km from gnss.origin and are not used; "
-            "correct it."
-        )
-        return (*self._notes, *((far,) if self._far else ()))
+        places, origin = self._far.array(), self._config.origin
+        if not len(places) or origin is None:
+            return tuple(self._notes)
+        far = f"{len(places)} GNSS position(s) are {_far_off(places[:: -(-len(places) // _MOST_PLACES)], origin)}"
+        return (*self._notes, far if self._used else Grave(far))

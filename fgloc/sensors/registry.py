@@ -94,6 +94,11 @@ def usual_names(role: str) -> tuple[str, ...]:
     return tuple(name for stream in streams_of(role) for name in stream.usual_names)
 
 
+def of_several(role: str) -> bool:
+    """Whether the messages of a role may be on several topics."""
+    return any(stream.several for stream in streams_of(role))
+
+
 def role_of_event(event: Event) -> str | None:
     """Role of a sensor's event; None if no sensor has it."""
     return _role_by_class(outside_sensors()).get(type(event))

@@ -3,7 +3,9 @@
 Found by its entry point, as a sensor of another package is: docs/adding-a-sensor.md goes through this file.
 
 A reading is a `sensor_msgs/Range` whose ``frame_id`` ends in the anchor's number ("anchor_3"). A driver with a message
-of its own needs one more converter. The settings::
+of its own needs one more converter. Topics that differ by a number only (a driver's topic for each anchor) are all
+read, and tell the number where ``frame_id`` has none; others are named by a pattern (``recording.topics.uwb:
+/radio/*``). The settings::
 
     uwb:
       anchors: {1: [0.0, 0.0, 2.1], 2: [6.0, 0.0, 2.1], 3: [6.0, 5.0, 2.3]}
@@ -32,14 +34,26 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from fgloc.config import GateConfig, Section
+from fgloc.config import Config, GateConfig, Section
 from fgloc.errors import ConfigError
-from fgloc.sensors.base import Context, FirstLook, FirstSection, FirstSettings, FoundRow, Parameter, Stream, When
+from fgloc.sensors.base import (
+    Context,
+    FirstLook,
+    FirstSection,
+    FirstSettings,
+    FoundRow,
+    Parameter,
+    Stream,
+    UnusableMessageError,
+    When,
+)
+from fgloc.sensors.checks import Table, count
 from fgloc.sensors.failures import EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, Landmark, SensorEvent
 
 _NUMBER = re.compile(r"(\d+)$")
+_IN_TOPIC = re.compile(r"(\d+)\D*$")
 _FARTHEST_M = 1e3  # that a radio of this kind reaches
 _LEAST_ANCHORS = 3  # that tell a place in the plane
 _AROUND = np.linspace(-math.pi, math.pi, 12, endpoint=False)  # of an anchor: where the search for the first pose begins
@@ -63,6 +77,7 @@ class UwbConfig(Section):
     )
     tag: tuple[_Metres, _Metres, _Metres] = Field((0.0, 0.0, 0.0), description="antenna in the base frame: x y z [m]")
     sigma_m: float = Field(0.1, ge=1e-3, le=10, description="noise of a range in line of sight")
+    unit_m: float = Field(1.0, ge=1e-4, le=10, description="of the messages' ranges [m]: 0.001 for millimetres")
     scale: float = Field(1.0, ge=0.1, le=10, description="reported over true range, bias_m subtracted")
     bias_m: float = Field(0.0, ge=-10, le=10, description="subtracted from every range")
     bias_sigma_m: float = Field(0.1, ge=0, le=10, description="sigma of bias_m")
@@ -108,17 +123,24 @@ class UwbEvent(SensorEvent):
 
 def from_range(message: Any, when: When) -> SensorEvent:
     """From `sensor_msgs/Range`."""
-    number = _NUMBER.search(message.header.frame_id.strip())
+    number = _NUMBER.search(message.header.frame_id.strip()) or _IN_TOPIC.search(when[2])
     if number is None:
-        raise ValueError(f"frame_id {message.header.frame_id!r} does not end in an anchor's number")
+        raise UnusableMessageError(
+            f"frame_id {message.header.frame_id!r} does not end in an anchor's number (expected such as anchor_3), and "
+            "the topic's name has none either: which anchor they are of is not known"
+        )
     return UwbEvent(*when, int(number.group(1)), float(message.range))
 
 
 def check(event: UwbEvent, gate: GateConfig) -> UwbEvent | str:
-    """The event, or why it cannot be used."""
-    if not math.isfinite(event.range_m):
+    """The event, in metres, or why it cannot be used."""
+    unit_m = gate.unit_m("uwb")
+    range_m = event.range_m * unit_m
+    if not math.isfinite(range_m):
         return "non_finite"
-    return event if gate.min_range <= event.range_m <= gate.max_range else "range_bound"
+    if not gate.min_range <= range_m <= gate.max_range:
+        return "range_bound"
+    return event if unit_m == 1.0 else replace(event, range_m=range_m)
 
 
 # --- Measurements -----------------------------------------------------------------------------------------------------
@@ -189,8 +211,21 @@ class NonLineOfSight(EventFailure):
 # --- First settings ---------------------------------------------------------------------------------------------------
 
 _FEWEST = 20  # ranges with a neighbour on either side that tell the noise
+_MOST_NOISE_M = 10.0  # that `uwb.sigma_m` may be
 _SPAN_S = 2.0  # of three ranges in a row that lie on a line but for noise and the robot's turns
 _FAR = 1.2  # times the longest range but one in a hundred: bound of ranges
+
+
+UNITS = {0.001: "millimetres", 0.01: "centimetres"}
+"""Units [m] of drivers that do not give metres."""
+_ROOM_M = 5.0  # that ranges reach at least
+
+
+def usual_unit(ranges: Sequence[float], bound: float) -> float | None:
+    """Unit [m] of ranges most of which are beyond a bound [m]; None: they are not, or it is not sure."""
+    middle, reach = np.percentile(ranges, [50.0, 99.0])
+    fitting = [unit for unit in UNITS if middle * unit <= bound < middle]
+    return fitting[0] if len(fitting) == 1 or (fitting and reach * fitting[0] > _ROOM_M) else None
 
 
 def _first_section(look: FirstLook) -> FirstSection:
@@ -198,11 +233,13 @@ def _first_section(look: FirstLook) -> FirstSection:
     events = [e for e in look.of(UwbEvent) if math.isfinite(e.range_m)]
     if not events:
         return FirstSection()
-    numbers = sorted({event.anchor for event in events})
+    unit_m = usual_unit([event.range_m for event in events], GateConfig().max_range) or 1.0
+    events = [replace(event, range_m=event.range_m * unit_m) for event in events]
+    heard = sorted({event.anchor for event in events})
     given = look.landmark_map.landmarks if look.landmark_map is not None else {}
     seen_otherwise = look.kinds & {"image", "sightings"}
-    places = {} if seen_otherwise else {i: given[i] for i in numbers if i in given}
-    shown = ", ".join(map(str, numbers[:12]))
+    places = {} if seen_otherwise else {i: given[i] for i in heard if i in given}
+    shown = ", ".join(map(str, heard[:12]))
     if len(places) >= _LEAST_ANCHORS:
         missing: tuple[str, ...] = ()
         lines = [
@@ -213,10 +250,12 @@ def _first_section(look: FirstLook) -> FirstSection:
     else:
         text = f"the places of the anchors {shown}, without which ranges are not used (uwb.anchors)"
         missing = (text if seen_otherwise else f"{text}; `fgloc map` finds them",)
-        lines = ["uwb:", f"  # anchors: {{{numbers[0]}: [0.0, 0.0, 2.0]}}  # x y z [m] in the map, of each of {shown}"]
+        lines = ["uwb:", f"  # anchors: {{{heard[0]}: [0.0, 0.0, 2.0]}}  # x y z [m] in the map, of each of {shown}"]
     lines.append("  # tag: [0.0, 0.0, 0.3]  # antenna in the base frame: x y z [m]")
+    if unit_m != 1.0:
+        lines.append(f"  unit_m: {unit_m:g}  # by their size the ranges are in {UNITS[unit_m]}")
     sigma = noise_m(events)
-    if sigma is not None and sigma > UwbConfig().sigma_m:
+    if sigma is not None and UwbConfig().sigma_m < sigma <= _MOST_NOISE_M:
         lines += ["  # By the scatter of ranges that follow one another.", f"  sigma_m: {sigma:.2g}"]
     far, usual = _FAR * float(np.percentile([event.range_m for event in events], 99.0)), GateConfig().max_range
     about = f"  # Ranges reach {far / _FAR:.0f} m."
@@ -245,6 +284,57 @@ def noise_m(events: Sequence[UwbEvent]) -> float | None:
     return None if len(off) < _FEWEST else 1.4826 * float(np.median(np.abs(off)))
 
 
+# --- For `fgloc info` -------------------------------------------------------------------------------------------------
+
+_MOST_SHOWN = 12  # anchors that are named
+_MOST_NUMBERS = 1000  # that are kept: damaged messages have any
+
+
+def numbers(some: Iterable[int]) -> str:
+    """The first of some anchors, for a sentence."""
+    ordered = sorted(some)
+    return ", ".join(map(str, ordered[:_MOST_SHOWN])) + (", ..." if len(ordered) > _MOST_SHOWN else "")
+
+
+class UwbChecks:
+    """Checks of a topic of ranges: anchors that the settings do not have, and ranges that will be rejected."""
+
+    def __init__(self) -> None:
+        self._heard: set[int] = set()
+        self._ranges = Table(1)
+
+    def add(self, event: Event) -> None:
+        """Add one event."""
+        assert isinstance(event, UwbEvent)
+        if len(self._heard) < _MOST_NUMBERS:
+            self._heard.add(event.anchor)
+        self._ranges.add(event.range_m)
+
+    def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
+        """Faults that were found, one sentence each."""
+        section: UwbConfig = getattr(config, Uwb.name, UwbConfig())
+        found, gate = [], config.gate
+        unknown = self._heard - section.anchors.keys()
+        if section.anchors and unknown != self._heard and unknown:
+            silent = section.anchors.keys() - self._heard
+            more = f", of which {numbers(silent)} are not heard on this topic" if silent else ""
+            found.append(
+                f"{topic}: ranges to anchors {numbers(unknown)} are not used, as uwb.anchors has "
+                f"{numbers(section.anchors)}{more}: give their places."
+            )
+        ranges = self._ranges.array()[:, 0] * section.unit_m
+        if (bad := ~np.isfinite(ranges)).any():
+            found.append(f"{topic}: {count(bad)} ranges are NaN or infinite and will be rejected.")
+        if (bad := np.isfinite(ranges) & ~((ranges >= gate.min_range) & (ranges <= gate.max_range))).any():
+            low, high = np.min(ranges[bad]), np.max(ranges[bad])
+            found.append(
+                f"{topic}: {count(bad)} ranges ({low:.4g} to {high:.4g} m) are not between {gate.min_range:g} and "
+                f"{gate.max_range:g} m and will be rejected: raise expert.gate.max_range if they are right, or set "
+                "uwb.unit_m (0.001 for millimetres, 0.01 for centimetres)."
+            )
+        return found
+
+
 # --- The sensor -------------------------------------------------------------------------------------------------------
 
 
@@ -255,7 +345,15 @@ class Uwb:
     needs: ClassVar[str] = "anchors"  # the setting without which it is not built
     Config: ClassVar[type[Section]] = UwbConfig
     streams: ClassVar[tuple[Stream, ...]] = (
-        Stream("uwb", UwbEvent, {"sensor_msgs/msg/Range": from_range}, ("uwb", "uwb/range"), False, check),
+        Stream(
+            "uwb",
+            UwbEvent,
+            {"sensor_msgs/msg/Range": from_range},
+            ("uwb", "uwb/range"),
+            check=check,
+            findings=UwbChecks,
+            several=True,
+        ),
     )
     failures: ClassVar[tuple[type[Section], ...]] = (NonLineOfSight,)
     first_settings: ClassVar[FirstSettings] = FirstSettings((UwbEvent,), _first_section)

@@ -25,6 +25,7 @@ from fgloc.live.wire.transport import Clock, Publication, Received, Transport
 from fgloc.recording.reader import TF_TYPES, MessageEvents, TopicInfo, select_roles, topic_key
 from fgloc.recording.standard_messages import MAP_FRAME
 from fgloc.recording.transforms import TF_TOPIC
+from fgloc.sensors import registry
 from fgloc.types import Estimate, Event, FloatArray, LandmarkMap, Severity
 
 # --- Intake: topics found by type, selected by role, decoded as those of a recording ----------------------------------
@@ -59,6 +60,7 @@ class Intake:
         self._found: tuple[Publication, ...] = ()
         self._changed_s = time.monotonic()
         self.roles: dict[Role, str] = {}
+        self._further: dict[str, Role] = {}  # topics of roles that have several
         self.undecodable: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self.truth, self.mapped = True, False
@@ -87,6 +89,8 @@ class Intake:
             raise WireError("\n".join(selection.problems))
         if not missing:
             self.roles = {**selection.roles, **self.roles}
+            others = {topic: role for role, topic in selection.roles.items() if registry.of_several(role)}
+            self._further |= {**others, **selection.also}
         return missing
 
     def subscribe(self) -> list[tuple[Role, str]]:
@@ -102,6 +106,7 @@ class Intake:
                 self._also.add(topic)
                 self._transport.read(topic, types[topic], self._on_message)
         wanted: dict[str, Role] = {topic: role for role, topic in self.roles.items()}
+        wanted |= self._further
         wanted |= dict.fromkeys(self._config.topics.of_joints if self.roles else (), "joints")
         new = [(role, topic) for topic, role in wanted.items() if topic not in self._role_of and topic in types]
         new = [(role, topic) for role, topic in new if self.truth or role != "truth"]
