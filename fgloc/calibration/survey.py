@@ -22,7 +22,7 @@ from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import Found, found_values
 from fgloc.config import Config, base_roles
 from fgloc.errors import ConfigError, MapError, RecordingError
-from fgloc.frames import homogeneous
+from fgloc.frames import homogeneous, rpy_matrix
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
@@ -125,9 +125,8 @@ def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
         parts.localizer.finish(False)
         notes = (*recording.notes, *parts.gate.notes)
     if not seen:
-        raise RecordingError(
-            f"{bag}: no marker was seen{_in_images(parts)}; see `fgloc info {bag}`, and markers.dictionary"
-        )
+        searched = "" if parts.detector is None else f" with {parts.detector.dictionary} in the images"
+        raise RecordingError(f"{bag}: no marker was seen{searched}; see `fgloc info {bag}`, and markers.dictionary")
     estimates = smooth_run(parts).estimates
     frames = list(parts.localizer.estimator.log.keyframes.values())
     return Drive(bag, parts, frames, np.array([e.pose for e in estimates]), dict(sorted(seen.items())), notes)
@@ -182,10 +181,6 @@ def _coarseness(corners: FloatArray) -> float:
     return max(1.0, (_SHARP_PX / max(side, 1.0)) ** 2)
 
 
-def _in_images(parts: Assembly) -> str:
-    return "" if parts.detector is None else f" with {parts.detector.dictionary} in the images"
-
-
 # --- Approximate poses of markers, and of two surveys that share some -------------------------------------------------
 
 _AGREE_M, _AGREE_PER_M, _AGREE_RAD = 0.15, 0.08, 0.6  # views of one marker that are nearer than this mean the same
@@ -202,12 +197,10 @@ class Guess:
     Attributes:
         T: ``(4, 4)`` takes its coordinates to those of the trajectory.
         agreeing: stamps of the views that agree.
-        views: how many there were.
     """
 
     T: FloatArray
     agreeing: frozenset[int]
-    views: int
 
 
 def guess(
@@ -267,7 +260,7 @@ def _agreed(views: list[tuple[int, float, list[FloatArray]]]) -> Guess:
         mean = Rotation.from_matrix(chosen[:, :3, :3]).mean().as_matrix()
         best = homogeneous(mean, np.median(chosen[:, :3, 3], axis=0))
     support = np.flatnonzero(_near(best, both, depths).any(axis=1))
-    return Guess(best, frozenset(views[i][0] for i in support), len(views))
+    return Guess(best, frozenset(views[i][0] for i in support))
 
 
 def _near(one: FloatArray, both: FloatArray, depths: FloatArray) -> FloatArray:
@@ -320,15 +313,7 @@ def _planar(T: FloatArray) -> FloatArray:
 def planar_matrix(pose: Iterable[float]) -> FloatArray:
     """Homogeneous matrix ``(4, 4)`` of a pose on the floor."""
     x, y, yaw = pose
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:2, 3] = x, y
-    return T
-
-
-def moved_poses(motion: FloatArray, poses: FloatArray) -> FloatArray:
-    """Poses ``(n, 3)`` in another frame."""
-    return np.array([se2.compose(motion, pose) for pose in poses]).reshape(-1, 3)
+    return homogeneous(rpy_matrix(0.0, 0.0, yaw), (x, y, 0.0))
 
 
 # --- Markers that may be turned in either of two directions -----------------------------------------------------------
@@ -372,7 +357,8 @@ def mirrored(
     Returns:
         None if there is no other direction: seen from the front, or from all around.
     """
-    cameras = np.array([_camera(m, pose) for m, pose in zip(measurements, poses, strict=True)])
+    mounted = np.array([m.camera.T_base_cam[:3, 3] for m in measurements])
+    cameras = np.column_stack([se2.placed(poses, mounted[:, :2]), mounted[:, 2]])
     sight = cameras - landmark.position
     sight = (sight / np.linalg.norm(sight, axis=1)[:, None]).mean(axis=0)
     sight = sight / np.linalg.norm(sight)
@@ -437,13 +423,6 @@ def moved_by(landmark: Landmark, move: FloatArray) -> Landmark:
     return replace(landmark, position=landmark.position + move[:3], rotation=turned)
 
 
-def _camera(m: PixelMeasurement, pose: FloatArray) -> FloatArray:
-    x, y, yaw = pose
-    c, s = np.cos(yaw), np.sin(yaw)
-    a, b, height = m.camera.T_base_cam[:3, 3]
-    return np.array([x + c * a - s * b, y + s * a + c * b, height])
-
-
 # --- The graph --------------------------------------------------------------------------------------------------------
 
 _WIDE_M, _WIDE_RAD = 0.5, 0.5  # sigmas of an unknown marker: next to nothing is known of it
@@ -495,6 +474,7 @@ class SurveyGraph:
     Attributes:
         installation: the parameters, the markers among them ...
         belief: ... and what was found of them.
+        views: accepted sightings, by marker.
         undecided: markers that fit in two directions about alike.
         landmark_map: the markers that these are deviations from.
     """
@@ -521,7 +501,7 @@ class SurveyGraph:
         wide = np.diag([_WIDE_M**2] * 3 + [_WIDE_RAD**2] * 3)
         held = {i: m if i in anchors else replace(m, cov=wide) for i, m in landmarks.items()}
         self.landmark_map = LandmarkMap(held)
-        self._views: Counter[int] = Counter()
+        self.views: Counter[int] = Counter()
         self.undecided: set[int] = set()
         self.installation = self._installation()
         self.belief = self.installation.prior()
@@ -544,7 +524,7 @@ class SurveyGraph:
                 self._log(factors), factors, self._config.batch, self._config.estimator.gate_probability
             )
             self.belief, self._poses = solver.installed(), solver.poses()
-            self._views = Counter(s.measurement.landmark_id for held in solver.accepted.values() for s in held)
+            self.views = Counter(s.measurement.landmark_id for held in solver.accepted.values() for s in held)
             better = self._look_from_the_other_side(solver)
             if self._still() and not better:
                 break
@@ -561,10 +541,6 @@ class SurveyGraph:
             out[i] = replace(self._found(landmark), cov=0.5 * (cov + cov.T))
         return out
 
-    def views(self) -> Counter[int]:
-        """Accepted sightings, by marker."""
-        return self._views
-
     def misfit(self, d: Distance) -> float:
         """Difference [sigma] of a distance in the graph from its estimate by all other measurements.
 
@@ -578,8 +554,7 @@ class SurveyGraph:
 
     def _found(self, landmark: Landmark) -> Landmark:
         first, _ = self.installation.landmarks[landmark.landmark_id]
-        move = self.belief.mean[first : first + 6]
-        return moved_by(landmark, move)
+        return moved_by(landmark, self.belief.mean[first : first + 6])
 
     def _look_from_the_other_side(self, solver: BatchSmoother) -> dict[int, Landmark]:
         """Markers that fit better in the mirrored direction; those that fit both equally are noted as undecided."""
@@ -589,10 +564,8 @@ class SurveyGraph:
                 seen.setdefault(m.landmark_id, []).append((m, pose))
         better = {}
         self.undecided = set()
-        for i, views in seen.items():
-            views = views[:: 1 + len(views) // _MOST_VIEWS]
-            if i in self._anchors:
-                continue
+        for i in seen.keys() - self._anchors:
+            views = seen[i][:: 1 + len(seen[i]) // _MOST_VIEWS]
             poses = np.array([pose for _, pose in views])
             found = self._found(self.landmark_map.landmarks[i])
             other = mirrored(found, [m for m, _ in views], poses, self.installation, self.belief.mean)
@@ -718,7 +691,7 @@ def survey(
     _need_ends(distances, start, left_out)
     graph = SurveyGraph(legs, start, set(anchors), config, distances)
     graph.solve()
-    surveyed, views = graph.landmarks(), graph.views()
+    surveyed, views = graph.landmarks(), graph.views
     left_out |= _undetermined(graph, surveyed, views, set(anchors), config.landmarks.min_sightings)
     if not set(surveyed) - set(left_out):
         listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
@@ -815,7 +788,8 @@ def _joined(
         for i, g in guesses.items():
             known.setdefault(i, planar_matrix(motion) @ g.T)
         free = bool(anchors) or bool(legs)
-        legs.append(Leg(one, moved_poses(motion, one.poses), _agreeing(guesses), free))
+        agreeing = {i: g.agreeing for i, g in guesses.items()}
+        legs.append(Leg(one, se2.compose_array(motion, one.poses), agreeing, free))
     if not known:
         listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
         raise RecordingError(f"{drives[0].bag}: no marker can be surveyed: {listed or 'none was seen'}")
@@ -824,10 +798,6 @@ def _joined(
     }
     seen = {i for leg in legs for i in leg.agreeing}
     return legs, {i: m for i, m in start.items() if i in seen}, {i: w for i, w in left_out.items() if i not in start}
-
-
-def _agreeing(guesses: Mapping[int, Guess]) -> dict[int, frozenset[int]]:
-    return {i: g.agreeing for i, g in guesses.items()}
 
 
 def _missed(d: Distance, sigmas: float) -> str:

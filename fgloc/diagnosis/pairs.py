@@ -101,21 +101,19 @@ class RateFit:
     share: float
 
 
-def fit_rate(path: Path, times: FloatArray, integral: FloatArray, longest_s: float = MOST_LAG_S) -> RateFit | None:
+def fit_rate(path: Path, times: FloatArray, integral: FloatArray) -> RateFit | None:
     """Scale and lag of a turn against the wheels' turn.
 
     Args:
         path: motion of the wheels.
         times: ``(n,)`` [s].
         integral: ``(n,)`` of the rate over time [rad], in whatever unit and sign it is reported.
-        longest_s: lags up to this are tried.
 
     Returns:
         None where the wheels do not turn, or the two share too little time.
     """
-    at = np.arange(
-        max(path.times[0], times[0]) + longest_s + 0.3, min(path.times[-1], times[-1]) - longest_s - 0.3, 0.1
-    )
+    first, last = max(path.times[0], times[0]), min(path.times[-1], times[-1])
+    at = np.arange(first + MOST_LAG_S + 0.3, last - MOST_LAG_S - 0.3, 0.1)
     at = at[path.known(at - 0.3, at + 0.3)]
     if len(at) < 50:
         return None
@@ -127,7 +125,7 @@ def fit_rate(path: Path, times: FloatArray, integral: FloatArray, longest_s: flo
         later = np.interp(at + late[:, None] + half_s, times, integral)
         return np.asarray((later - np.interp(at + late[:, None] - half_s, times, integral)) / (2.0 * half_s))
 
-    late, share = best_lag(lambda lags: explained(reference, rates(lags, _RATE_HALF_S))[1], longest_s)
+    late, share = best_lag(lambda lags: explained(reference, rates(lags, _RATE_HALF_S))[1], MOST_LAG_S)
     turned = path.yaw_rate(at, _TURN_HALF_S)  # over longer: a driver's filter takes from short turns
     scale = float(explained(turned, rates(np.array([late]), _TURN_HALF_S))[0][0])
     near = np.arange(late - 0.1, late + 0.1001, 0.02)

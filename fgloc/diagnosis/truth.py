@@ -35,10 +35,12 @@ from fgloc.diagnosis.pairs import (
 from fgloc.diagnosis.signals import Path, in_order
 from fgloc.types import FloatArray, Severity
 
+_WINDOW_S = 2.0  # over which displacements are compared
 _SCALE = 0.03  # of a distance: less is a constant, which the graph estimates
 _RESPONSE_S = 0.1  # a robot follows its commands with a lag of its own, which is no clock's
 _WHEELS_OFF = 0.2  # logarithm of a way that a unit or a gear leaves
 _PRIOR_SIGMAS = 4.0  # of the wheels, by which a truth may find them off: what is further off no run estimates
+_GAP_S = 0.25  # between two poses of the truth, over which it is interpolated
 _KNOWN_YAW = 0.01  # rad: sigma of the yaw of a tracked body that hardly turned
 _FROZEN_S, _MOVES_MPS, _FROZEN_SHARE = 0.1, 0.05, 0.02  # of a truth; fewer repetitions are a slower source's
 _TURNS_RAD, _WINDOWS = 0.05, 6  # rad in a second, for so many of them
@@ -76,13 +78,12 @@ class BodyFit:
     share: float
 
 
-def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | None:
+def fit_body(path: Path, poses: FloatArray) -> BodyFit | None:
     """Mounting of a body with given poses, and their errors, from its displacements and the wheels'.
 
     Args:
         path: motion of the wheels.
         poses: rows of time, x, y and continuous yaw.
-        window_s: over which displacements are compared.
 
     Returns:
         None where the two share too little time, or the robot does not move.
@@ -91,23 +92,23 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
     rate = fit_rate(path, times, yaw)
     by_turn = None if rate is None or rate.share < FOLLOWS else rate.late_s
     late = 0.0 if by_turn is None else by_turn.value
-    start = np.arange(path.times[0], path.times[-1] - window_s, 0.2)
-    start = start[path.known(start, start + window_s)]
-    start = start[_covered(times, start + late) & _covered(times, start + window_s + late)]
+    start = np.arange(path.times[0], path.times[-1] - _WINDOW_S, 0.2)
+    start = start[path.known(start, start + _WINDOW_S)]
+    start = start[_covered(times, start + late) & _covered(times, start + _WINDOW_S + late)]
     if len(start) < 40:
         return None
     if by_turn is None:
         late = _speed_lag(path, poses, start)
-    fits = {m: _body(path, poses, start, window_s, late, m) for m in (False, True)}
+    fits = {m: _body(path, poses, start, late, m) for m in (False, True)}
     mirrored = fits[True][1] < 0.5 * fits[False][1]
     if fits[False][0][2] < 0.0 and fits[True][1] < 2.0 * fits[False][1]:  # it went so straight that both fit
-        mirrored = _course_turns(path, poses, start, window_s, late) < 0.0
+        mirrored = _course_turns(path, poses, start, late) < 0.0
     (alpha, lever, turns), misfit, travelled = fits[mirrored]
     if travelled < 0.1:
         return None
     left_out = []
     for block in np.array_split(np.arange(len(start)), BLOCKS):
-        x = _body(path, poses, np.delete(start, block), window_s, late, mirrored)[0]
+        x = _body(path, poses, np.delete(start, block), late, mirrored)[0]
         turned = math.remainder(np.angle(x[0]) - np.angle(alpha), math.tau)
         left_out.append((x[2], abs(x[0]), turned, x[1].real, x[1].imag))
     s = jackknife(np.array(left_out)).tolist()
@@ -124,17 +125,17 @@ def fit_body(path: Path, poses: FloatArray, window_s: float = 2.0) -> BodyFit | 
     )
 
 
-def _course_turns(path: Path, poses: FloatArray, start: FloatArray, window_s: float, late: float) -> float:
+def _course_turns(path: Path, poses: FloatArray, start: FloatArray, late: float) -> float:
     """Turn of a body's course from half a window to the next, times that of the wheels: negative for a mirror image."""
-    places = [_at(poses, start + late + share * window_s)[0] for share in (0.0, 0.5, 1.0)]
+    places = [_at(poses, start + late + share * _WINDOW_S)[0] for share in (0.0, 0.5, 1.0)]
     bend = ((places[2] - places[1]) * (places[1] - places[0]).conj()).imag
-    yaw = [np.interp(start + share * window_s, path.times, path.poses[:, 2]) for share in (0.25, 0.75)]
+    yaw = [np.interp(start + share * _WINDOW_S, path.times, path.poses[:, 2]) for share in (0.25, 0.75)]
     return float(bend @ (yaw[1] - yaw[0]))
 
 
-def _covered(times: FloatArray, at: FloatArray, longest_s: float = 0.25) -> NDArray[np.bool_]:
+def _covered(times: FloatArray, at: FloatArray) -> NDArray[np.bool_]:
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    return np.asarray((times[after] - times[after - 1] < longest_s) & (at >= times[0]) & (at <= times[-1]))
+    return np.asarray((times[after] - times[after - 1] < _GAP_S) & (at >= times[0]) & (at <= times[-1]))
 
 
 def _at(poses: FloatArray, at: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -158,22 +159,22 @@ def _length(places: FloatArray) -> FloatArray:
 
 
 def _body(
-    path: Path, poses: FloatArray, start: FloatArray, window_s: float, late: float, mirrored: bool
+    path: Path, poses: FloatArray, start: FloatArray, late: float, mirrored: bool
 ) -> tuple[tuple[complex, complex, float], float, float]:
     """Least squares of displacements: of the body in its axes, by those of the base and by the lever arm.
 
     With the body at l in the base, turned by δ: ``e^{iδ} s d_body = d_base + (e^{iφ} - 1) l``.
     """
     p1, r1 = complex_poses(path, start)
-    p2, r2 = complex_poses(path, start + window_s)
+    p2, r2 = complex_poses(path, start + _WINDOW_S)
     base, turn = (p2 - p1) / r1, r2 / r1
     q1, psi1 = _at(poses, start + late)
-    q2, psi2 = _at(poses, start + window_s + late)
+    q2, psi2 = _at(poses, start + _WINDOW_S + late)
     own = (q2 - q1) * np.exp(-1j * psi1)
     turned = np.asarray(psi2 - psi1)
     if mirrored:
         own, turned = own.conj(), -turned
-    phi = np.interp(start + window_s, path.times, path.poses[:, 2]) - np.interp(start, path.times, path.poses[:, 2])
+    phi = np.interp(start + _WINDOW_S, path.times, path.poses[:, 2]) - np.interp(start, path.times, path.poses[:, 2])
     turns = 1.0
     if float(np.std(phi)) > 0.05:
         turns, share = (float(of[0]) for of in explained(turned, phi[None]))

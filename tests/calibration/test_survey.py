@@ -341,7 +341,7 @@ def test_frames_are_not_aligned_by_markers_of_which_most_were_moved_by_a_metre()
 
 def test_a_marker_turned_the_wrong_way_is_found_again_from_the_other_side():
     true = standing(3, 2.0, 0.4, np.pi + 0.6)
-    poses = [np.array([x, y, 0.1]) for x in (0.0, 0.3) for y in (-0.4, 0.0, 0.3)]
+    poses = np.array([[x, y, 0.1] for x in (0.0, 0.3) for y in (-0.4, 0.0, 0.3)])
     noise = np.random.default_rng(7).normal(0.0, 0.3, (len(poses), 4, 2))
     seen = [PixelMeasurement(0, 3, project(p, true) + n, 0.5, CAMERA) for p, n in zip(poses, noise, strict=True)]
     installation = Installation({f"map.3.{name}": 0.5 for name in MARKER})
