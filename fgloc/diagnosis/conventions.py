@@ -16,6 +16,7 @@ from fgloc.diagnosis import gyro, landmarks, odometry, truth
 from fgloc.diagnosis.comparison import WHEELS, Conventions
 from fgloc.diagnosis.landmark_fits import Mounting, fit_sightings
 from fgloc.diagnosis.pairs import LAG_SIGMAS, LATE_S, TELLS, Figure, RateFit, fit_rate, varied, weighted
+from fgloc.diagnosis.positions import check_positions
 from fgloc.diagnosis.ranges import check_radio, check_ranges
 from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.diagnosis.steering import check_steering
@@ -54,6 +55,7 @@ def conventions(
     path = gyro.by_hand(found, path)
     driver = odometry.driver_late(found, path)
     turn = gyro.check_gyro(found, path)
+    check_positions(found, path)
     by_ranges = check_ranges(found, path)
     if by_ranges is not path:
         path, turn = by_ranges, gyro.check_gyro(found, by_ranges) if found.opposite else turn

@@ -18,6 +18,7 @@ from fgloc.frames import quaternion_yaw
 from fgloc.intake.validation import EventValidator, reported_bounds
 from fgloc.recording.reader import Recording
 from fgloc.sensors.equipment import LandmarkSensor
+from fgloc.sensors.gnss import GnssEvent
 from fgloc.sensors.uwb import UwbEvent
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
@@ -131,6 +132,7 @@ class Signals:
         truth: rows of time, position ``(3,)`` and quaternion ``(4,)``.
         seen: rows of time, landmark and point ``(3,)``.
         ranges: rows of time, anchor and range [m] by radio.
+        positions: rows of time, east and north of the origin [m], and reported sigma [m], of GNSS; 0: none is reported.
         spatial: whether the points of ``seen`` have three measured coordinates.
         images: whether the recording has images, which are not read here.
         odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
@@ -144,6 +146,7 @@ class Signals:
     true_yaw: bool = True  # whether the truth has one
     seen: list[tuple[float, ...]] = field(default_factory=list)
     ranges: list[tuple[float, int, float]] = field(default_factory=list)
+    positions: list[tuple[float, ...]] = field(default_factory=list)
     odometry: list[tuple[float, ...]] = field(default_factory=list)
     spatial: bool = False
     images: bool = False
@@ -238,6 +241,7 @@ class SignalCollector:
             roles: topics, to note what passes between stamp and receipt; None: that is not noted.
         """
         self.found = Signals(images="image" in base_roles(roles or ()))
+        self._origin = getattr(getattr(config, "gnss", None), "origin", None)
         self._role_of = {topic: role for role, topic in (roles or {}).items()}
         any_unit = dict.fromkeys(("max_range", "max_position"), _FARTHEST)
         self._gate = EventValidator(reported_bounds(config).model_copy(update=any_unit))
@@ -291,6 +295,9 @@ class SignalCollector:
             self.found.truth.append((at_s, *passed.position.tolist(), *passed.orientation.tolist()))
         elif isinstance(passed, UwbEvent):
             self.found.ranges.append((at_s, passed.anchor, passed.range_m))
+        elif isinstance(passed, GnssEvent):
+            if self._origin is not None and (place := passed.near(self._origin)) is not None:
+                self.found.positions.append((at_s, *place.tolist(), math.sqrt(max(0.5 * np.trace(passed.cov), 0.0))))
         elif isinstance(passed, SightingsEvent) and not passed.in_pixels:
             self.found.seen.extend(self._points(passed, at_s))
         return True

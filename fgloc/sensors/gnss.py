@@ -92,6 +92,12 @@ class GnssEvent(SensorEvent):
     cov: FloatArray  # (2, 2) m², east and north; zeros if the message gives none
     fixed: bool
 
+    def near(self, origin: tuple[float, float, float]) -> FloatArray | None:
+        """Place ``(2,)`` east and north of an origin [m]; None: it is too far from there."""
+        altitude = self.altitude if math.isfinite(self.altitude) else origin[2]
+        place = east_north(self.latitude, self.longitude, altitude, origin)
+        return None if math.hypot(*place) > _FARTHEST_M else place
+
 
 def from_fix(message: Any, when: When) -> SensorEvent:
     """From `sensor_msgs/NavSatFix`."""
@@ -348,9 +354,8 @@ class Gnss:
         """One position, if it is not far from the origin."""
         config = self._config
         assert config.origin is not None
-        altitude = event.altitude if math.isfinite(event.altitude) else config.origin[2]
-        local = east_north(event.latitude, event.longitude, altitude, config.origin)
-        if math.hypot(*local) > _FARTHEST_M:
+        local = event.near(config.origin)
+        if local is None:
             self._far.add(event.latitude, event.longitude)
             return
         self._used = True

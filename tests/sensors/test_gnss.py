@@ -8,7 +8,10 @@ import pytest
 from fgloc import run
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import config_of
-from fgloc.diagnosis.mistakes import inspect_all
+from fgloc.diagnosis.comparison import Conventions
+from fgloc.diagnosis.mistakes import find_mistakes, inspect_all
+from fgloc.diagnosis.positions import check_positions
+from fgloc.diagnosis.signals import Path, Signals
 from fgloc.types import Severity
 from fgloc_datasets.bag import BagWriter
 
@@ -90,3 +93,36 @@ def test_sound_positions_are_not_doubted(tmp_path):
     bag = write(tmp_path, seconds=6)
     assert not [f for f in inspect_all(bag, None, settings()).found if "/fix" in f.text]
     assert "# origin: [48.137" in first_settings(bag).text
+
+
+# --- Noise ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("sigma", "cov", "named"), [(1.0, 0.0004, True), (1.0, 1.0, False), (0.05, 0.0004, False)])
+def test_a_covariance_that_is_too_small_by_far_is_named_with_the_scale(tmp_path, sigma, cov, named):
+    bag = write(tmp_path, seconds=60, cov=cov, sigma=sigma)
+    config = settings(antenna=(0.0, 0.0))
+    found = [f for f in find_mistakes(bag, None, config).findings if f.code == "gnss.sigma"]
+    assert bool(found) == named
+    if named:
+        assert found[0].severity is Severity.ERROR
+        assert float(found[0].lines["gnss.sigma_scale"]) == pytest.approx(sigma / math.sqrt(cov), rel=0.3)
+
+
+def test_an_antenna_far_from_the_base_does_not_make_noise():
+    """A lever arm of a metre that is not known, and wheels 2 % long, with positions of 2 cm."""
+    rng, t = np.random.default_rng(1), np.arange(0.0, 80.0, 0.05)
+    yaw = 0.8 * np.sin(0.4 * t)
+    place = np.cumsum(0.05 * np.exp(1j * yaw))
+    path = Path(t, np.column_stack([1.02 * place.real, 1.02 * place.imag, yaw]), np.zeros(len(t), np.int64), "odometry")
+    fixes = (place + (1.0 + 0.4j) * np.exp(1j * yaw))[::20]
+    fixes += rng.normal(0.0, 0.02, len(fixes)) + 1j * rng.normal(0.0, 0.02, len(fixes))
+    rows = [(s, z.real, z.imag, 0.02) for s, z in zip(t[::20], fixes, strict=True)]
+    found = Conventions(settings(), Signals(positions=rows))
+    check_positions(found, path)
+    assert not found.codes
+    check_positions(found := Conventions(settings(), Signals(positions=[(*row[:3], 0.001) for row in rows])), path)
+    assert not found.codes  # too little to be told from the wheels' errors
+    noisy = [(s, x + rng.normal(0.0, 0.5), y + rng.normal(0.0, 0.5), 0.02) for s, x, y, _ in rows]
+    check_positions(found := Conventions(settings(), Signals(positions=noisy)), path)
+    assert found.codes == {"gnss.sigma"}
