@@ -19,10 +19,8 @@ from fgloc.types import FloatArray
 
 _LONGEST_S, _FEWEST, _FEWEST_WINDOWS = 20.0, 8, 3  # of a window, positions in one, and windows
 _UNKNOWNS = 3  # complex ones of a window: its shift, its turn and length, and its lever arm
-_FACTOR, _LEAST_M = (
-    5.0,
-    0.1,
-)  # noise over what is reported from which on it is named; and that the wheels surely resolve
+_FACTOR = 5.0  # noise over what is reported, from which on it is named ...
+_LEAST_M = 0.1  # ... if it is more than this, which the wheels surely resolve
 _MOST_SCALE = 100.0  # that `gnss.sigma_scale` may be
 
 

@@ -118,6 +118,7 @@ class Localizer:
         # 5. Judge by the fused pose: the motion sources' drift, and landmarks that were moved
         if seen.accepted:
             self.tracking.record_fix()
+            self.tracking.confirm({s.measurement.row_kind for s in seen.accepted})
         self.motion.commit(motion, belief if seen.accepted else None, seen.observes_yaw)
         moved, pose_changed = self.sightings.exclude_moved(step, motion, seen)
         if pose_changed:
@@ -194,8 +195,9 @@ class Localizer:
         """Go on from a place that nothing connects with the estimated pose; ``decisions``: that led there."""
         before, place = self.estimator.belief, found.newest
         if before is not None:
-            decisions = [*decisions, place_decision(self.estimator.k + 1, step.stamp_ns, before, place, JUMP)]
-            self.tracking.found(before, place)
+            row = place_decision(self.estimator.k + 1, step.stamp_ns, before, place, JUMP)
+            decisions = [*decisions, row]
+            self.tracking.found(before, place, "" if self.motion.is_carried else found.witness, row.nis)
         self.estimator.forget_contradictions()
         self.motion.restart()
         self.sightings.association.forget_contradictions()
@@ -365,7 +367,7 @@ class Recorder:
         clock_variance = self._clock_sigma_s**2 + self._motion.sources.clock_sigma_s(frame) ** 2
         by_clock = np.asarray(np.outer(twist, twist) * clock_variance)
         carried, around = tracking.kidnapped(self._sightings.association.contradicting, belief)
-        frame.added_cov = by_clock
+        frame.added_cov = by_clock + tracking.doubt_cov(belief)
         frame.carried_cov = carried * around  # of a mixture of two Gaussians, the second one wide
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + tracking.lost_cov(belief)

@@ -160,6 +160,13 @@ class InitialPose:
     gathered: bool = False
     displaced: dict[int, Displacement] | None = None
 
+    @property
+    def witness(self) -> str:
+        """The one source of all that was seen, such as a receiver of positions; empty: several, or landmarks."""
+        seen = [m for collected in self.steps for m in collected.sightings]
+        kinds = {m.row_kind for m in seen}
+        return kinds.pop() if len(kinds) == 1 and not any(m.of_landmark for m in seen) else ""
+
 
 class GlobalSearch:
     """Collects steps while the pose is unknown.

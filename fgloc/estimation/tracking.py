@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +16,11 @@ from fgloc.estimation.unnamed import AMBIGUOUS
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.measurement_log import LoggedSighting, PoseWithCovariance
 from fgloc.sensors.measurements import LandmarkMeasurement
-from fgloc.types import Decision, FloatArray, LandmarkMap, Mode, MotionMeasurement, MotionReadings, Step
+from fgloc.types import Decision, FloatArray, Grave, LandmarkMap, Mode, MotionMeasurement, MotionReadings, Step
 
 _CONFIRMED = 2  # sightings in excess of those that contradict it: more confirm a given pose
 CONTRADICTS = "contradicts initial_pose"
+_CONTRADICTED = 50.0  # NIS of a place of three coordinates: one in 10^10 by chance
 _NOWHERE_M = 3.0  # sigma of a position above which no sighting can be judged by the prediction
 
 
@@ -51,6 +52,9 @@ class Tracking:
         self._confirming = self._contradicting = 0  # sightings
         self._jump: FloatArray | None = None  # the first one ...
         self._jump_count = 0  # ... of so many
+        self._doubt = np.zeros(2)  # [m] in the map, from where motion had led to where one source alone is ...
+        self._witness = ""  # ... and that source
+        self._doubted: tuple[str, float, float] | None = None  # the first such source, how far, and by how many sigmas
         self._reported = False  # whether an unconfirmed pose was reported
         self._places = self.global_search.hypotheses.places
         self._never_found = False
@@ -65,6 +69,7 @@ class Tracking:
             known: where it starts, by the user or an earlier run.
         """
         self.lost = self._given = self._reported = False
+        self._doubt, self._witness = np.zeros(2), ""
         self.global_search.reset()
         if known is not None:
             return known
@@ -232,13 +237,47 @@ class Tracking:
             return started  # what is gathered has no consensus nearby: that may need all of the collected time
         return started if apart(predicted.pose, started.newest.pose) else None
 
-    def found(self, estimated: PoseWithCovariance, place: PoseWithCovariance) -> None:
-        """Note that the robot was found at another place than estimated, and end the search."""
+    def found(
+        self, estimated: PoseWithCovariance, place: PoseWithCovariance, witness: str = "", nis: float = 0.0
+    ) -> None:
+        """Note that the robot was found at another place than estimated, and end the search.
+
+        Args:
+            estimated: its pose before.
+            place: its pose now.
+            witness: the one source that says so, where nothing shows that the robot was lifted; empty: there are more.
+            nis: of the difference of both, by their covariances.
+        """
+        if witness and nis > _CONTRADICTED and not self.lost:
+            self._doubt = self._doubt + place.pose[:2] - estimated.pose[:2]
+            self._witness = witness
+            self._doubted = self._doubted or (witness, float(np.hypot(*self._doubt)), float(np.sqrt(nis)))
+            if np.hypot(*self._doubt) < _NOWHERE_M * max(1.0, float(np.sqrt(estimated.cov[:2, :2].trace()))):
+                self._doubt = np.zeros(2)  # it is back where motion had led to
+        elif not witness:
+            self._doubt = np.zeros(2)
         self._jump_count += 1
         if self._jump is None:
             self._jump = se2.between(estimated.pose, place.pose)
         self.lost = self._given = False
         self.global_search.forget()
+
+    def confirm(self, witnesses: Collection[str]) -> None:
+        """Note sources that agree with the pose: one beside that which a jump rests on ends the doubt of it."""
+        if self._witness and not set(witnesses) <= {self._witness}:
+            self._doubt, self._witness = np.zeros(2), ""
+
+    def doubt_cov(self, belief: PoseWithCovariance) -> FloatArray:
+        """Covariance ``(3, 3)`` to add, in the body frame, where motion and one other source contradict each other.
+
+        Which of both is wrong is not known: the robot is as probably at the other place.
+        """
+        cov = np.zeros((3, 3))
+        if self._doubt.any():
+            c, s = np.cos(belief.pose[2]), np.sin(belief.pose[2])
+            away = np.array([[c, s], [-s, c]]) @ self._doubt
+            cov[:2, :2] = 0.5 * np.outer(away, away)
+        return cov
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -247,6 +286,16 @@ class Tracking:
         if self._jump is not None:
             more = f", and {self._jump_count - 1} times more" if self._jump_count > 1 else ""
             sentences.append(f"sightings contradicted the estimated pose: jumped by {_far(self._jump)}{more}")
+        if self._doubted is not None:
+            witness, far_m, sigmas = self._doubted
+            sentences.append(
+                Grave(
+                    f"the sensor {witness} alone put the robot {far_m:.2f} m from where its motion had led it "
+                    f"({sigmas:.0f} sigma of both), and nothing showed that it was lifted: which of both is wrong is "
+                    "not known, and the position is as uncertain from there on. Look at the trajectory; a receiver "
+                    "that lost its signals may go on beside the truth with a small covariance"
+                )
+            )
         if self._never_found:
             sentences.append(
                 "the sightings never determined where on the map the robot is: its poses are LOST, and right relative "

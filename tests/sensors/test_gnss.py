@@ -126,3 +126,23 @@ def test_an_antenna_far_from_the_base_does_not_make_noise():
     noisy = [(s, x + rng.normal(0.0, 0.5), y + rng.normal(0.0, 0.5), 0.02) for s, x, y, _ in rows]
     check_positions(found := Conventions(settings(), Signals(positions=noisy)), path)
     assert found.codes == {"gnss.sigma"}
+
+
+# --- One witness ------------------------------------------------------------------------------------------------------
+
+
+def test_a_jump_of_one_receiver_that_the_wheels_contradict_is_a_warning_and_the_position_uncertain(tmp_path):
+    count = iter(range(1000))
+
+    def after_a_tunnel(place):
+        k = next(count)
+        return (math.nan, math.nan) if 20 <= k < 30 else (place[0] + 25.0 / M_PER_DEG * (k >= 30), place[1])
+
+    bag = write(tmp_path, after_a_tunnel, seconds=50, cov=0.0004, sigma=0.02)
+    result = run(bag, None, settings(), "batch")
+    (finding,) = (f for f in result.findings if "which of both is wrong is not known" in f.text)
+    assert finding.severity is Severity.WARNING
+    assert finding.text.startswith("The sensor gnss alone put the robot 2")
+    sigma = np.sqrt(result.trajectory.covs[:, 0, 0] + result.trajectory.covs[:, 1, 1])
+    assert sigma[-1] > 10.0
+    assert sigma[len(sigma) // 4] < 0.1
