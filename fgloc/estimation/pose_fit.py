@@ -57,13 +57,18 @@ def fit_pose(
     return PoseFit(sightings, factors).solve(start)
 
 
+def _kernel(m: LandmarkMeasurement) -> float:
+    """Constant k of the Cauchy kernel in the fit of a pose [sigma]; `benchmarks.mechanisms` takes it away."""
+    return m.cauchy_k
+
+
 class PoseFit:
     """Sightings of one base, to be fitted from several starting poses."""
 
     def __init__(self, sightings: Sequence[LandmarkMeasurement], factors: LandmarkFactors) -> None:
         self._observed = factors.observe(sightings)
         self._theta, self._cov = factors.estimated.mean, factors.estimated.cov
-        self._k = np.array([m.cauchy_k for m in sightings])
+        self._k = np.array([_kernel(m) for m in sightings])
         self._whitening: dict[int, FloatArray] = {}  # by kind
 
     def solve(self, start: FloatArray) -> Fit | None:
