@@ -162,10 +162,10 @@ class InitialPose:
 
     @property
     def witness(self) -> str:
-        """The one source of all that was seen, such as a receiver of positions; empty: several, or landmarks."""
+        """The one receiver of positions that all was seen by; empty: several, or landmarks or anchors, which differ."""
         seen = [m for collected in self.steps for m in collected.sightings]
         kinds = {m.row_kind for m in seen}
-        return kinds.pop() if len(kinds) == 1 and not any(m.of_landmark for m in seen) else ""
+        return kinds.pop() if len(kinds) == 1 and not any(m.of_landmark or m.dof < 2 for m in seen) else ""
 
 
 class GlobalSearch:
