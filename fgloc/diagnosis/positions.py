@@ -49,7 +49,7 @@ def check_positions(found: Conventions, path: Path) -> None:
 
 
 def _left(path: Path, rows: FloatArray) -> Iterator[FloatArray]:
-    """What each window leaves of its positions [m], both axes, freed of what its unknowns take up."""
+    """Residuals [m] of the positions in each window about the wheels' path, scaled up for its fitted unknowns."""
     first, last = max(path.times[0], rows[0, 0]), min(path.times[-1], rows[-1, 0])
     length = min(_LONGEST_S, max((last - first) / _FEWEST_WINDOWS, 1.0))
     for k in range(int((last - first) / length + 1e-6)):

@@ -82,7 +82,7 @@ def _numbers(name: str, value: Any, where: str) -> FloatArray:
     except (TypeError, ValueError):
         array = np.empty((0,) * (len(shape) + 1))
     fits = len(array.shape) == len(shape) and all(s is None or n == s for n, s in zip(array.shape, shape, strict=True))
-    if not fits and not (array.shape == (0,) and shape[:1] == (None,)):
+    if not fits:
         size = " x ".join("n" if n is None else str(n) for n in shape) or "1"
         numbers = "1 number" if size == "1" else f"{size} numbers"
         raise EstimatorError(f"{where}: {name} is {reprlib.repr(value)}; expected {numbers}: {meaning}")
@@ -97,7 +97,9 @@ def _wrong_argument(method: Callable[..., Any], given: Mapping[str, Any]) -> Non
         if name == "markers" and isinstance(value, Mapping):
             for corners in value.values():
                 _numbers(name, corners, method.__name__)
-        elif name != "image":
+        elif name == "image":
+            raise EstimatorError(f"{method.__name__}: image is {reprlib.repr(value)}; expected {_SHAPES[name][1]}")
+        else:
             _numbers(name, value, method.__name__)
 
 
@@ -107,14 +109,14 @@ def _explained(method: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(method)
     def called(self: Live, *args: Any, **kwargs: Any) -> Any:
-        given = signature.bind(self, *args, **kwargs).arguments
-        _wrong_argument(method, given)
         try:
             return method(self, *args, **kwargs)
         except (AttributeError, IndexError, TypeError, ValueError) as error:
-            if "image" in given:
-                image = reprlib.repr(given["image"])
-                raise EstimatorError(f"{method.__name__}: image is {image}; expected {_SHAPES['image'][1]}") from error
+            try:
+                given = signature.bind(self, *args, **kwargs).arguments
+            except TypeError:
+                raise error from None  # of a call that Python itself refuses
+            _wrong_argument(method, given)
             raise EstimatorError(
                 f"{method.__name__}: {error}; expected values as help(fgloc.Live.{method.__name__}) has them"
             ) from error
