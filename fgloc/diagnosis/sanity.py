@@ -366,12 +366,13 @@ def judged(track: Track, estimates: Sequence[Estimate]) -> Verdict:
     if why is not None or ours.explained < _WELL:
         textbook = _textbook(track, alone, laid, max(ours.explained, by_odometry.explained))
         if textbook is not None:
-            return replace(textbook, odometry=_as_trajectory(track, laid, _dead_reckoned(track, estimates[0])))
+            alone_covs = _dead_reckoned(track, estimates[0])
+            return replace(textbook, odometry=_as_trajectory(track.stamps_ns, laid, alone_covs))
     if why is not None:
         return _simpler(track, estimates, laid, by_odometry, why)
     unsure = _unsure(track, ours, by_odometry)
     findings = () if unsure is None else (Finding("sanity.unsure", unsure, Severity.WARNING),)
-    return Verdict(findings, None, _as_trajectory(track, laid, _dead_reckoned(track, estimates[0])))
+    return Verdict(findings, None, _as_trajectory(track.stamps_ns, laid, _dead_reckoned(track, estimates[0])))
 
 
 def _worse_than_odometry(track: Track, ours: Comparison, odometry: Comparison) -> str | None:
@@ -448,7 +449,7 @@ def _simpler(track: Track, estimates: Sequence[Estimate], poses: FloatArray, by:
     contradicted = 1.0
     if math.isfinite(by.residual):
         contradicted = float(np.clip(by.residual / _PLAIN, 1.0, _WORST))
-    trajectory = _as_trajectory(track, poses, _dead_reckoned(track, estimates[0], contradicted))
+    trajectory = _as_trajectory(track.stamps_ns, poses, _dead_reckoned(track, estimates[0], contradicted))
     text = f"The estimate explains the recording worse than odometry alone{_IN_ITS_PLACE}: {why}."
     return Verdict((Finding("sanity.odometry", text, Severity.ERROR),), _estimates(trajectory), trajectory)
 
@@ -464,8 +465,8 @@ def _textbook(track: Track, alone: FloatArray, laid: FloatArray, explained: floa
     if len(track.ids) < _SIGHTINGS or track.landmarks is None:  # without a map it can bend as the estimate does
         return None
     kept = np.arange(0, len(laid), max(1, -(-len(laid) // _MOST_POSES)))
-    some = replace(track, stamps_ns=track.stamps_ns[kept], joined=np.ones(len(kept), dtype=np.int64))
-    nearest = np.clip(np.searchsorted(some.stamps_ns, track.seen_ns), 0, len(kept) - 1)
+    stamps_ns = track.stamps_ns[kept]
+    nearest = np.clip(np.searchsorted(stamps_ns, track.seen_ns), 0, len(kept) - 1)
     then = se2.interpolate(track.stamps_ns, alone, track.seen_ns)
     places = se2.placed(se2.between_array(alone[kept[nearest]], then), track.places)
     solved = textbook_poses(
@@ -477,24 +478,27 @@ def _textbook(track: Track, alone: FloatArray, laid: FloatArray, explained: floa
     if solved is None:
         return None
     poses, covs = solved
-    some = some.seen((track.seen_ns >= some.stamps_ns[0]) & (track.seen_ns <= some.stamps_ns[-1]))
-    theirs = compared(some, poses, alone[kept])
+    before = np.searchsorted(kept, np.arange(len(laid)), side="right") - 1  # the odometry leads to those left out
+    whole = se2.compose_array(poses[before], se2.between_array(alone[kept[before]], alone))
+    given = replace(track, joined=np.ones(len(laid), dtype=np.int64))
+    given = given.seen((track.seen_ns >= stamps_ns[0]) & (track.seen_ns <= stamps_ns[-1]))
+    theirs = compared(given, whole, alone)
     if departs(theirs.departure, theirs.strain, mapped=False) or theirs.explained < max(explained + _MORE, _WELL):
         return None
     worst = max(1.0, theirs.residual / _PLAIN)
-    given = _as_trajectory(some, poses, covs * worst**2)
+    smoothed = _as_trajectory(stamps_ns, poses, covs * worst**2)
     text = (
         f"The estimate explains the recording worse than plain smoothing with fixed constants{_IN_ITS_PLACE}: that "
         f"explains {_percent(theirs.explained)} of the sightings, the estimate at most "
         f"{_percent(explained)}."
     )
-    return Verdict((Finding("sanity.textbook", text, Severity.ERROR),), _estimates(given, Mode.OK), None)
+    return Verdict((Finding("sanity.textbook", text, Severity.ERROR),), _estimates(smoothed, Mode.OK), None)
 
 
-def _as_trajectory(track: Track, poses: FloatArray, covs: FloatArray) -> Trajectory:
+def _as_trajectory(stamps_ns: NDArray[np.int64], poses: FloatArray, covs: FloatArray) -> Trajectory:
     """A trajectory of poses with covariances of their right perturbations."""
     turned = np.array([se2.rotate_cov(cov, yaw) for cov, yaw in zip(covs, poses[:, 2].tolist(), strict=True)])
-    return Trajectory(track.stamps_ns, poses, 0.5 * (turned + turned.transpose(0, 2, 1)))
+    return Trajectory(stamps_ns, poses, 0.5 * (turned + turned.transpose(0, 2, 1)))
 
 
 def _dead_reckoned(track: Track, first: Estimate, contradicted: float = 1.0) -> FloatArray:
