@@ -353,6 +353,17 @@ def test_the_twist_is_used_where_the_poses_heading_is_not_that_of_its_motion(dri
     assert any("5.7°" in note for note in wheels.notes)
 
 
+def test_a_pose_whose_heading_is_off_bridges_a_silence_of_the_whole_robot(drive):
+    turned = (0.0, 0.0, 0.1)
+    rate = times(0.1, 20, 20)
+    events = [odometry(t, se2.compose(drive.pose(t), turned), drive.twist(t)) for t in rate if not 10.0 < t < 18.0]
+    steps = run(stepper(), events)
+    pose, _, wheels = total(steps, WheelsConfig())
+    assert wheels.by_twist
+    assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=0.1)
+    assert not wheels.rejections
+
+
 def test_a_later_better_source_takes_over(drive):
     events = in_order_of_receipt(
         [command(t, *drive.twist(t)) for t in times(0.1, 18, 20)],

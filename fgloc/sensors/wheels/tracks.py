@@ -436,6 +436,7 @@ class OdometryTrack(Track):
         self._paths = [0.0, 0.0, 0.0, 0.0]  # pose: m, rad; twist: m, rad
         self._along = 0j  # sum of the pose's motions times the conjugate of the twist's [m²]
         self._across = np.zeros(3)  # sums over these products of |.|², |.|² angle, |.|² angle² [m⁴]
+        self._askew = 0.0  # angle from the way to the way by the pose's heading, where the twist is used for it [rad]
 
     @property
     def by_twist(self) -> bool:
@@ -469,6 +470,9 @@ class OdometryTrack(Track):
         moved = self._between_poses(pose, mean, seconds)
         if both and mean is not None and moved is not None and not self._compared:
             self._compare(moved, mean, seconds)
+        if moved is not None and self._askew:
+            c, s = math.cos(self._askew), math.sin(self._askew)
+            moved = c * moved[0] + s * moved[1], c * moved[1] - s * moved[0], moved[2]
         if moved is None or mean is None:
             return moved or mean
         if self._mode == "pose":
@@ -485,12 +489,13 @@ class OdometryTrack(Track):
         """
         assert self._last_ns is not None
         before = self._pose or pose
+        insists = self._config.source == "twist"  # else a twist is used as the pose's heading is off its way, or it stands
         stands = pose == before and self._twist is not None and any(self._twist)
         restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*before[:2])
         dx, dy, dyaw = _difference(before, pose)
         little = math.hypot(dx, dy) < _BRIDGED_M and abs(dyaw) < _BRIDGED_RAD
         whole = self._given_ns <= self._last_ns + self._hold_ns
-        return self._mode != "twist" and (little or whole) and not stands and not restarted
+        return not insists and (little or whole) and not stands and not restarted
 
     def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
         """The constant twist from the last pose to this one; None if that cannot be known."""
@@ -552,12 +557,10 @@ class OdometryTrack(Track):
                 raise ConfigError(f"{text}; set wheels.source to pose, or wheels.scale_omega to {math.pi / 180:.6f}")
             text += ": pose differences are used"
         elif abs(heading) > _HEADING_RAD + spread:
-            mode, text = (
-                "twist",
-                (
-                    f"the odometry's twist is used: the heading of its pose is {math.degrees(-heading):+.1f}° off the "
-                    "direction in which the pose moves"
-                ),
+            mode, self._askew = "twist", heading
+            text = (
+                f"the odometry's twist is used: the heading of its pose is {math.degrees(-heading):+.1f}° off the "
+                "direction in which the pose moves"
             )
         else:
             used = "the odometry's twist is used" if insists else "differences of the odometry's pose are used"
