@@ -407,6 +407,12 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
                     "positions of these messages are used where there are any. If they count ticks or degrees, set "
                     "wheels.drive with its ticks_per_turn (docs/drives.md); else record velocities in rad/s."
                 )
+            if 2 * rejections.get(f"{sensor}.duplicate_stamp", 0) > count:
+                text = (
+                    f"{count} messages of {sensor} were dropped ({reasons}): their topic had a message of that stamp "
+                    "already. Recorded twice, or of two publishers, nothing is lost; stamps of a clock that stands "
+                    f"between messages are replaced by recording.received_stamps: [{sensor}]."
+                )
             yield Finding(f"{sensor}.dropped", text, Severity.WARNING if used else Severity.NOTE, value=float(count))
 
 

@@ -41,3 +41,11 @@ def test_dropped_sightings_name_the_noise_of_corners_or_of_places(cameras, secti
     assert section in dropped.text
     assert ({"markers.", "landmarks."} - {section}).pop() not in dropped.text
     assert "map." not in dropped.text  # none was given
+
+
+def test_messages_that_came_twice_are_not_put_down_to_the_noise():
+    result = figure_eight()
+    said = all_findings(result, None, {"sightings.duplicate_stamp": 400, "sightings.gate": 20}, len(result.trajectory))
+    (dropped,) = [finding for finding in said if finding.code == "sightings.dropped"]
+    assert "recording.received_stamps: [sightings]" in dropped.text
+    assert "sigma" not in dropped.text

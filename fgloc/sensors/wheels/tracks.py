@@ -489,7 +489,7 @@ class OdometryTrack(Track):
         """
         assert self._last_ns is not None
         before = self._pose or pose
-        insists = self._config.source == "twist"  # else a twist is used as the pose's heading is off its way, or it stands
+        insists = self._config.source == "twist"  # else a twist is used as the pose stands, or its heading is off
         stands = pose == before and self._twist is not None and any(self._twist)
         restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*before[:2])
         dx, dy, dyaw = _difference(before, pose)
