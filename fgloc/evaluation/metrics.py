@@ -327,16 +327,19 @@ class Size:
         scale: distances of the estimate over those of the truth.
         rigid_m: rmse of positions [m] after the best rigid motion, SE(2).
         scaled_m: after the best similarity, Sim(2).
+        sigma_m: rms that the covariance expects of positions [m]; 0: there is none.
     """
 
     scale: float
     rigid_m: float
     scaled_m: float
+    sigma_m: float
 
     @property
     def told(self) -> bool:
-        """Whether the scale is what most of the error comes from."""
-        return abs(self.scale - 1.0) >= _SIZE_OFF and self.scaled_m < _SIZE_EXPLAINS * self.rigid_m
+        """Whether the scale is what most of the error comes from, and the covariance does not explain it."""
+        beyond = self.rigid_m > _SIZE_BEYOND * self.sigma_m
+        return beyond and abs(self.scale - 1.0) >= _SIZE_OFF and self.scaled_m < _SIZE_EXPLAINS * self.rigid_m
 
     @property
     def gross(self) -> bool:
@@ -357,6 +360,7 @@ class Size:
 _SIZE_OFF = 0.01  # share; smaller scales are lost in other errors
 _SIZE_GROSS = 2.0  # times, or one part of
 _SIZE_EXPLAINS = 0.5  # largest share of the error that is left
+_SIZE_BEYOND = 1.5  # sigmas
 
 
 def size_of(matched: Matched) -> Size | None:
@@ -368,7 +372,8 @@ def size_of(matched: Matched) -> Size | None:
         return None
     scale, turned = abs(common) / spread, truth * common / abs(common)
     left = [float(np.sqrt((abs(estimate - factor * turned) ** 2).mean())) for factor in (1.0, scale)]
-    return Size(scale, left[0], left[1] / scale)
+    sigma = 0.0 if matched.covs is None else float(np.sqrt(matched.covs[:, [0, 1], [0, 1]].sum(axis=1).mean()))
+    return Size(scale, left[0], left[1] / scale, sigma)
 
 
 def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
