@@ -27,6 +27,9 @@ has a frame of its own always.
   begun alike, and 5 cm more, and NEES/3 over 6: whose covariance is wrong, too.
 - ``field.window.geomean_over_odometry``: as above, of the windows whose truth's frame is fitted, as the odometry's is.
 - ``field.window.nees``: as above, of all windows that end with 0.
+
+``--changes NAMES`` (``all``, or some of `benchmarks.field_changes.CHANGES`): each change in one such window, of a recording
+that the seed draws (with ``--only`` of these): ``field.change.*``, as the rows of windows.
 """
 
 # ruff: noqa: E501 (lines of the page)
@@ -52,6 +55,7 @@ import numpy as np
 import yaml
 
 from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.field_changes import CHANGES, MAPS, changed
 from benchmarks.field_peers import Heard, hear, textbook
 from benchmarks.field_recordings import RECORDINGS, Recording, window
 from benchmarks.field_sheet import MODES, SHEET, SOUND, Mode, Outcome, false_findings, found, right_cause
@@ -279,6 +283,25 @@ def windows(count: int, seed: int, only: Sequence[str] = (), mapped: bool = True
             first = rng.uniform(0.0, 1.0 - share)
             if not only or recording.name in only:
                 chosen.append(window(recording, first, first + share, mapped))
+    yield from _of_parts("window", chosen)
+
+
+def changes(names: Sequence[str], seed: int, only: Sequence[str] = ()) -> Iterator[Row]:
+    """Rows of windows of recordings with one thing changed in each."""
+    if not DATA.is_dir():
+        yield from not_run(["field.change.lost"], f"no {DATA}; set FGLOC_REAL_DATA")
+        return
+    chosen = []
+    for name in names or (*CHANGES, *MAPS):
+        rng = random.Random(f"{name} {seed}")
+        able = [r for r in RECORDINGS if r.truth and r.landmarks and (r.frame == "map" or name not in MAPS)]
+        recording = rng.choice([r for r in able if not only or r.name in only])
+        first = rng.uniform(0.0, 0.3)
+        chosen.append(changed(window(recording, first, first + 0.7), name, seed))
+    yield from _of_parts("change", chosen)
+
+
+def _of_parts(kind: str, chosen: Sequence[Recording]) -> Iterator[Row]:
     with ThreadPoolExecutor(_WORKERS) as pool:
         outcomes = dict(zip(chosen, pool.map(outcome, chosen), strict=True))
     for r, o in outcomes.items():
@@ -286,17 +309,17 @@ def windows(count: int, seed: int, only: Sequence[str] = (), mapped: bool = True
     runs = [(r, o, mode) for r, o in outcomes.items() for mode in MODES]
     for r, o, mode in runs:
         if mode in o.ate:
-            yield Row(f"field.window.{r.name}.{mode}.ate_m", o.ate[mode], unit="m")
+            yield Row(f"field.{kind}.{r.name}.{mode}.ate_m", o.ate[mode], unit="m")
     lost = [f"{r.name}.{mode}" for r, o, mode in runs if _lost(o, mode)]
-    yield Row("field.window.lost", float(len(lost)), n=len(runs), unit=" ".join(lost))
+    yield Row(f"field.{kind}.lost", float(len(lost)), n=len(runs), unit=" ".join(lost))
     fitted = [(o, mode) for r, o, mode in runs if r.frame == "se2" and {mode, "odometry"} <= o.ate.keys()]
     logs = np.log([o.ate[mode] / o.ate["odometry"] for o, mode in fitted])
     if len(logs):
-        yield Row("field.window.geomean_over_odometry", float(np.exp(logs.mean())), float(logs.std()), len(logs))
+        yield Row(f"field.{kind}.geomean_over_odometry", float(np.exp(logs.mean())), float(logs.std()), len(logs))
     judged = [nees for _, o, mode in runs if o.codes.get(mode) == 0 and (nees := nees_of(o, mode)) is not None]
     if judged:
         good = [_NEES[0] <= nees <= _NEES[1] for nees in judged]
-        yield Row("field.window.nees", float(np.mean(good)), n=len(judged))
+        yield Row(f"field.{kind}.nees", float(np.mean(good)), n=len(judged))
 
 
 def _lost(o: Outcome, mode: Mode) -> bool:
@@ -496,11 +519,15 @@ if __name__ == "__main__":
     parser.add_argument("--windows", type=int, default=0, metavar="N", help="of each recording; default: the whole")
     parser.add_argument("--seed", type=int, default=0, help="of the windows")
     parser.add_argument("--unmapped", action="store_true", help="windows without the sets' maps")
+    parser.add_argument("--changes", default="", metavar="NAMES", help="comma-separated; all")
     known, rest = parser.parse_known_args()
     named = tuple(filter(None, known.only.split(",")))
 
     def rows(quick: bool) -> Iterator[Row]:
-        """Rows of windows, or of the recordings."""
+        """Rows of windows, of changes, or of the recordings."""
+        if known.changes:
+            asked = () if known.changes == "all" else tuple(known.changes.split(","))
+            return changes(asked, known.seed, named)
         if known.windows:
             return windows(known.windows, known.seed, named, not known.unmapped)
         return measure(quick, named, known.page)

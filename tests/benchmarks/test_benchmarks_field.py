@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
+from benchmarks import field_recordings
 from benchmarks.field import Outcome, ate, crash, distances
+from benchmarks.field_changes import CHANGES, MAPS, changed
 from benchmarks.field_peers import Heard, clean, textbook
-from benchmarks.field_recordings import RECORDINGS
+from benchmarks.field_recordings import RECORDINGS, Recording
 from benchmarks.field_sheet import SHEET, SOUND, Trap, false_findings, found, right_cause
 from fgloc import se2
-from fgloc.types import Trajectory
+from fgloc.frames import yaw_quaternion
+from fgloc.recording.messages import default_typestore
+from fgloc.sensors.maps import write_map
+from fgloc.types import Landmark, LandmarkMap, Trajectory
+from fgloc_datasets.convert import new_bag
 
 ARM = np.array([0.12, -0.05])
 T_MAP_TRUTH = np.array([2.0, -1.0, 0.8])
@@ -138,3 +146,43 @@ def test_the_sheet_is_of_recordings_and_no_trap_is_sound():
     for trap in SHEET:
         assert not trap.said or (trap.figure is not None) == ("(?P<value>" in re.compile(trap.said).pattern)
         assert trap.code or trap.said
+
+
+def _small(_, out):
+    """Twenty seconds of a circle at 5 Hz with sightings of three landmarks, and their map."""
+    with new_bag(out, "mcap") as bag:
+        for k in range(100):
+            t, yaw = 10**18 + k * 2 * 10**8, 0.1 * k
+            pose = (4.0 * math.sin(yaw), 4.0 * (1.0 - math.cos(yaw)), yaw)
+            bag.odometry("/odom", t, pose, (2.0, 0.0, 0.5))
+            bag.range_bearing("/landmarks", t, [(i, 3.0 + 0.01 * k, 0.2) for i in (1, 2, 3)])
+            bag.truth("/truth", t, (*pose[:2], 0.0), yaw_quaternion(yaw).tolist())
+    write_map(
+        LandmarkMap({i: Landmark(i, np.array([i, 1.0, 0.0]), np.eye(3), 0.0) for i in (1, 2, 3)}), out / "map.yaml"
+    )
+
+
+def _content(bag):
+    with AnyReader([bag], default_typestore=default_typestore()) as reader:
+        rows = [(c.topic, received, bytes(raw)) for c, received, raw in reader.messages()]
+    return [row for row in rows if row[0] == "/truth"], [row for row in rows if row[0] != "/truth"]
+
+
+SMALL = Recording("small", "", "", _small, "/truth", "map")
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    out = tmp_path_factory.mktemp("plain")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(field_recordings, "DATA", out)
+        return *_content(SMALL.bag(out)), (out / "map.yaml").read_text()
+
+
+@pytest.mark.parametrize("name", [*CHANGES, *MAPS][::3])
+def test_a_change_changes_what_is_sensed_or_the_map_and_never_the_truth(plain, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(field_recordings, "DATA", tmp_path)
+    truth, sensed = _content(changed(SMALL, name, 1).bag(tmp_path))
+    assert truth == plain[0]
+    assert (sensed != plain[1]) == (name in CHANGES)
+    assert ((tmp_path / "map.yaml").read_text() != plain[2]) == (name in MAPS)
