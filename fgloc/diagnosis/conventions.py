@@ -70,7 +70,7 @@ def conventions(
     sensor = None if seen is None else landmarks.check_sensor(found, by_gyro, seen, turn_sigma)
     if found.config.wheels != found.wheels:
         path, found.wheels = found.read_again(path), found.config.wheels
-    landmarks.check_map_unit(found, path, seen)
+    landmarks.check_map(found, path, seen)
     drifting = _drifts(found, path)
     undecided &= "imu.sign" not in found.codes
     body = None if undecided else truth.true_body(found, path)  # wheels that may turn the wrong way judge no truth

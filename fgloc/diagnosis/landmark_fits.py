@@ -49,6 +49,7 @@ _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheel
 _MAP_WINDOWS_S = (8.0, 20.0, 50.0)  # over which landmarks are compared with a map: the shortest that shows three
 _COARSE_S = (20.0, 50.0, 120.0, 300.0)  # likewise where one is in view at a time
 _COARSE_MISFIT, _COARSE_OF_THREE = 0.25, 0.1  # of a map so compared; three landmarks fit many maps
+_CLEARLY = 0.5  # of the misfit of all others
 _MAP_STEP, _FEWEST_WINDOWS = 0.625, 3  # from window to window, in their widths; of windows with three landmarks
 _STEEPEST = 30.0  # of a prior's cost: its exponential is a number
 _WINDOW_S = (
@@ -491,34 +492,79 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
     return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit)
 
 
-def coarse_scale(
-    path: Path, seen: Sightings, place: tuple[float, float], places: dict[int, FloatArray]
-) -> tuple[float, int] | None:
-    """Scale of a map over distances by wheels and sightings, of landmarks that need not be in one view.
+@dataclass(frozen=True, slots=True)
+class CoarseFit:
+    """A map laid onto places by the wheels.
 
-    The way from one landmark to the next is the wheels', whose drift leaves a unit of length to be told, and no more.
+    Attributes:
+        kind: "": as configured; "map": mirrored; "bearings": mirrored; "mirror": one of the two; "left", "back",
+            "right": the sensor looks there from where it is configured to.
+        scale: of the map's distances over those by wheels and sightings.
+        count: landmarks that tell it.
+    """
+
+    kind: str
+    scale: float
+    count: int
+
+
+LOOKS = {"left": 1j, "back": -1.0, "right": -1j}
+"""Turns by which a sensor may look elsewhere than configured, as factors of its bearings."""
+
+
+def coarse_fit(
+    path: Path, seen: Sightings, place: tuple[float, float], places: dict[int, FloatArray]
+) -> CoarseFit | None:
+    """Lay a map onto places by wheels and sightings, of landmarks that need not be in one view; None: it fits nowhere.
+
+    The way from one landmark to the next is the wheels', whose drift leaves a unit of length, a mirror image or a
+    quarter turn of the sensor to be told, and no more.
 
     Args:
         path: motion of the wheels.
         seen: sightings in the base's axes.
         place: of the sensor [m].
         places: ``(2,)`` on the map [m], by id.
-
-    Returns:
-        The scale, and the number of landmarks that tell it; None: the map fits nowhere.
     """
     p, r = complex_poses(path, seen.times)
-    q = p + r * (planar(seen.points, "body") + complex(*place))
+    z = planar(seen.points, "body")
+    readings = {"": z, "map": z, **{kind: turn * z for kind, turn in LOOKS.items()}}
+    if not seen.spatial:
+        readings["bearings"] = z.conj()
     for width in _COARSE_S:
-        fits = []
-        for window in _places_seen(path, seen, q, width):
-            common = [i for i in window if i in places]
-            scales, misfits = _laid_on([window], places, 0, False)
-            fits += [(misfit, scale, len(common)) for scale, misfit in zip(scales, misfits, strict=True)]
-        if fits:
-            misfit, scale, count = max(fits, key=lambda fit: (fit[2], -fit[0]))
-            if misfit < (_COARSE_MISFIT if count > 3 else _COARSE_OF_THREE):
-                return scale, count
+        fits: dict[str, tuple[int, float, float]] = {}  # landmarks, misfit with a minus, scale
+        for kind, reading in readings.items():
+            windows = [
+                (sum(i in places for i in window), window)
+                for window in _places_seen(path, seen, p + r * (reading + complex(*place)), width)
+            ]
+            laid = [
+                (count, -misfit, scale)
+                for count, window in windows
+                for scale, misfit in zip(*_laid_on([window], places, 0, kind == "map"), strict=True)
+            ]
+            if laid:
+                fits[kind] = max(laid)
+        found = _clearest(fits)
+        if found is not None:
+            return found
+    return None
+
+
+def _clearest(fits: dict[str, tuple[int, float, float]]) -> CoarseFit | None:
+    """Fit as configured or, where another is better by far than all, that one; None: none is good enough.
+
+    Bearings and a map that are mirror images look alike while the robot hardly moves.
+    """
+    misfits = {kind: -misfit for kind, (_, misfit, _) in fits.items()}
+    least = min(misfits, key=lambda kind: misfits[kind], default="")
+    alike = {"map", "bearings"} if least in ("map", "bearings") else {least}
+    clear = all(misfits[least] < _CLEARLY * misfit for kind, misfit in misfits.items() if kind not in alike)
+    if least and fits[least][0] > 3 and misfits[least] < _COARSE_MISFIT and clear:
+        sure = all(misfits[least] < _CLEARLY * misfits[kind] for kind in alike & misfits.keys() - {least})
+        return CoarseFit(least if sure else "mirror", fits[least][2], fits[least][0])
+    if "" in fits and misfits[""] < (_COARSE_MISFIT if fits[""][0] > 3 else _COARSE_OF_THREE):
+        return CoarseFit("", fits[""][2], fits[""][0])
     return None
 
 

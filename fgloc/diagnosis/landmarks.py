@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,8 +15,9 @@ from fgloc.config import Config, with_value
 from fgloc.diagnosis.comparison import GEAR, WHEELS, Conventions, unit_of
 from fgloc.diagnosis.landmark_fits import (
     AXES,
+    LOOKS,
     Mounting,
-    coarse_scale,
+    coarse_fit,
     compared,
     fit_map,
     fit_on_map,
@@ -54,6 +56,7 @@ _BY_FAR, _NEARLY = 5.0, 2.0  # times a misfit: of what is refuted by few landmar
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
 _NO_DRIFT = math.log(7.0)  # of a scale: less may be wheels that drift, and no map in feet is named so
 _COARSELY = math.log(1.3)  # by which a scale by wheels alone may miss a unit
+_MIRROR_IMAGE = "The map is a mirror image of what is seen: change the sign of all its y"
 _SCALED = {"map.unit", "map.contradiction", "map.mirrored", "map.ids", "sightings.scale", "wheels.scale", "scales"}
 _FIRST_S = 8.0  # of sightings that tell where a run began: wheels err by centimetres over it
 _LATER_S, _FITS_M = (20.0, 40.0), 0.5  # likewise, where they show a robot that fits the map so well
@@ -452,7 +455,7 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
         if fit.shift:
             found.add("map.ids", f"The map's ids are {fit.shift:+d} against those seen", None, Figure(fit.shift, 0.0))
         if fit.mirrored:
-            found.add("map.mirrored", "The map is a mirror image of what is seen: change the sign of all its y")
+            found.add("map.mirrored", _MIRROR_IMAGE)
         # distances on the map over reported ranges, which one view tells; over the wheels', by way of the ranges
         ranges = Figure(by_wheels.value * fit.scale.value, by_wheels.value * fit.scale.sigma)
         relative = math.hypot(fit.scale.sigma / fit.scale.value, by_wheels.sigma / by_wheels.value)
@@ -487,16 +490,36 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
     found.add("sightings.scale", text, lines, by_wheels)
 
 
-def check_map_unit(found: Conventions, path: Path, seen: Sightings | None) -> None:
-    """Name the unit of a map whose landmarks are hardly ever in one view: by the wheels' way from one to the next."""
+def check_map(found: Conventions, path: Path, seen: Sightings | None) -> None:
+    """Name what a map shows whose landmarks are hardly ever in one view: its unit, a mirror image, a sensor turned."""
     if seen is None or len(found.places) < 3 or path.source not in WHEELS or found.codes & _SCALED:
         return
     T = _place(found)
     as_given, _ = as_configured(found, seen)
-    fitted = coarse_scale(path, as_given, (float(T[0, 3]), float(T[1, 3])), found.places)
+    fitted = coarse_fit(path, as_given, (float(T[0, 3]), float(T[1, 3])), found.places)
     if fitted is None:
         return
-    scale, count = fitted
+    scale, count, kind = fitted.scale, fitted.count, fitted.kind
+    if kind == "map":
+        found.add("map.mirrored", _MIRROR_IMAGE)
+    elif kind == "mirror":
+        text = f"Map or bearings are a mirror image, by {count} landmarks: change the sign of all its y, or of bearings"
+        found.add("map.mirrored", text)
+    elif kind:
+        turn = LOOKS.get(kind)
+        R = rotation_to_base("body, upside down") if turn is None else rpy_matrix(0.0, 0.0, cmath.phase(turn))
+        moved = homogeneous(R @ T[:3, :3])
+        moved[:3, 3] = T[:3, 3]
+        pose = sensor_pose(moved, found.config.recording.sightings_axes == "optical")
+        text = f"The landmarks stand as on the map, by {count} of them, if "
+        if turn is None:
+            text += "bearings count to the right (or the sensor is upside down)"
+        else:
+            text += f"the sensor looks {math.degrees(cmath.phase(turn)):+.0f}° further left than configured"
+        line = {"recording.sightings_pose": [round(v, 4) + 0.0 for v in pose]}
+        found.add("sightings.mirrored" if turn is None else "sightings.mounting", text, line)
+    if kind:
+        return
     unit = unit_of(1.0 / scale, _COARSELY, speeds=False)
     if unit is None and abs(math.log(scale / 10.0)) < _COARSELY:
         unit = 0.1, "decimetres"

@@ -344,21 +344,45 @@ def test_on_a_straight_way_the_unit_of_ranges_or_of_the_wheels_are_both_told():
     assert "range_scale" in found["wheels.unit"].text
 
 
+def one_at_a_time(map_of=lambda place: place, seen_as=lambda away: away, every=1):
+    """Sightings of one beacon after the other, for ten seconds each, and settings and map: what `conventions` takes."""
+    rng, some = np.random.default_rng(4), slice(None, None, 20)
+    t, x, y, yaw = TIMES[some], X[some], Y[some], YAW[some]
+    motion = [odometry(s, twist=(v, w)) for s, v, w in zip(t, SPEED[some], RATE[some], strict=True)]
+    which = (t / 10.0).astype(int)
+    away = (BEACONS[which] - np.column_stack([x, y])) @ [1.0, 1j] * np.exp(-1j * yaw)
+    away = seen_as(away + rng.normal(0.0, 0.01, len(t)) + 1j * rng.normal(0.0, 0.01, len(t)))
+    seen = [(s, float(i), z.real, z.imag, 0.0) for s, i, z in zip(t, which, away, strict=True)][::every]
+    places = {i: map_of(np.array([bx, by, 0.0])) for i, (bx, by) in enumerate(BEACONS.tolist())}
+    landmarks = LandmarkMap({i: Landmark(i, place, np.eye(3), 0.0) for i, place in places.items()})
+    return Signals(motion=motion, seen=seen), Config(), None, None, landmarks
+
+
+@pytest.mark.parametrize(
+    ("mistake", "code", "yaw"),
+    [
+        ({"map_of": lambda place: place * [1.0, -1.0, 1.0]}, "map.mirrored", None),
+        ({"seen_as": np.conj}, "sightings.mirrored", 0.0),
+        ({"seen_as": lambda away: 1j * away}, "sightings.mounting", -0.5 * math.pi),
+        ({"seen_as": lambda away: -away}, "sightings.mounting", math.pi),
+    ],
+)
+def test_mirror_images_and_a_turned_sensor_are_named_where_the_wheels_alone_tell_nothing(
+    monkeypatch, mistake, code, yaw
+):
+    monkeypatch.setattr("fgloc.diagnosis.landmarks.fit_sightings", lambda *_, **__: {})
+    (found,) = [f for f in conventions(*one_at_a_time(**mistake)).findings if f.code.startswith(("map.", "sightings."))]
+    assert (found.code, found.severity) == (code, Severity.ERROR)
+    if yaw is not None:
+        last = float(found.lines["recording.sightings_pose"].strip("[]").split(",")[-1])
+        assert math.cos(last - yaw) == pytest.approx(1.0, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("factor", "scale"), [(1.0, None), (1.6, None), (100.0, "0.01"), (1.0 / FOOT, None), (10.0, "0.1")]
 )
 def test_the_unit_of_a_map_is_named_where_one_landmark_is_in_view_at_a_time(factor, scale):
-    rng, some = np.random.default_rng(4), slice(None, None, 20)
-    t, x, y, yaw = TIMES[some], X[some], Y[some], YAW[some]
-    motion = [odometry(s, twist=(v, w)) for s, v, w in zip(t, SPEED[some], RATE[some], strict=True)]
-    which = (t / 10.0).astype(int)  # each beacon for ten seconds
-    away = (BEACONS[which] - np.column_stack([x, y])) @ [1.0, 1j] * np.exp(-1j * yaw)
-    away += rng.normal(0.0, 0.01, len(t)) + 1j * rng.normal(0.0, 0.01, len(t))
-    seen = [(s, float(i), z.real, z.imag, 0.0) for s, i, z in zip(t, which, away, strict=True)]
-    landmarks = {
-        i: Landmark(i, factor * np.array([bx, by, 0.0]), np.eye(3), 0.0) for i, (bx, by) in enumerate(BEACONS.tolist())
-    }
-    found = conventions(Signals(motion=motion, seen=seen), Config(), landmark_map=LandmarkMap(landmarks)).findings
+    found = conventions(*one_at_a_time(map_of=lambda place: factor * place)).findings
     named = [(f.code, f.severity, f.lines) for f in found if f.code.startswith("map.")]
     assert named == ([] if scale is None else [("map.unit", Severity.ERROR, {"map.scale": scale})])
 
