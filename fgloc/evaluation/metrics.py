@@ -418,6 +418,11 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
                     "already. Recorded twice, or of two publishers, nothing is lost; stamps of a clock that stands "
                     f"between messages are replaced by recording.received_stamps: [{sensor}]."
                 )
+            if 2 * rejections.get(f"{sensor}.unknown_id", 0) > count:
+                text = (
+                    f"{count} sightings of {sensor} were dropped ({reasons}): the map lacks their landmarks. `fgloc map "
+                    "BAG --anchor MAP.yaml --out MAP2.yaml` adds them to it."
+                )
             yield Finding(f"{sensor}.dropped", text, Severity.WARNING if used else Severity.NOTE, value=float(count))
 
 

@@ -43,9 +43,14 @@ def test_dropped_sightings_name_the_noise_of_corners_or_of_places(cameras, secti
     assert "map." not in dropped.text  # none was given
 
 
-def test_messages_that_came_twice_are_not_put_down_to_the_noise():
+@pytest.mark.parametrize(
+    ("reason", "remedy"),
+    [("duplicate_stamp", "recording.received_stamps: [sightings]"), ("unknown_id", "fgloc map")],
+)
+def test_what_was_dropped_by_no_noise_is_not_put_down_to_it(reason, remedy):
     result = figure_eight()
-    said = all_findings(result, None, {"sightings.duplicate_stamp": 400, "sightings.gate": 20}, len(result.trajectory))
+    counts = {f"sightings.{reason}": 400, "sightings.gate": 20}
+    said = all_findings(result, None, counts, len(result.trajectory))
     (dropped,) = [finding for finding in said if finding.code == "sightings.dropped"]
-    assert "recording.received_stamps: [sightings]" in dropped.text
+    assert remedy in dropped.text
     assert "sigma" not in dropped.text
