@@ -49,7 +49,7 @@ _TRACK_S = 6.0  # over which one landmark's sightings are held against the wheel
 _MAP_WINDOWS_S = (8.0, 20.0, 50.0)  # over which landmarks are compared with a map: the shortest that shows three
 _COARSE_S = (20.0, 50.0, 120.0, 300.0)  # likewise where one is in view at a time
 _COARSE_MISFIT, _COARSE_OF_THREE = 0.25, 0.1  # of a map so compared; three landmarks fit many maps
-_CLEARLY = 0.5  # of the misfit of all others
+_CLEARLY, _NO_DOUBT = 0.5, 0.05  # of the misfit of all others; misfit by the wheels' drift alone
 _MAP_STEP, _FEWEST_WINDOWS = 0.625, 3  # from window to window, in their widths; of windows with three landmarks
 _STEEPEST = 30.0  # of a prior's cost: its exponential is a number
 _WINDOW_S = (
@@ -497,8 +497,8 @@ class CoarseFit:
     """A map laid onto places by the wheels.
 
     Attributes:
-        kind: "": as configured; "map": mirrored; "bearings": mirrored; "mirror": one of the two; "left", "back",
-            "right": the sensor looks there from where it is configured to.
+        kind: "": as configured; "map": mirrored; "bearings": mirrored; "mirror": one of the two; "turn": the wheels
+            turn the other way; "left", "back", "right": the sensor looks there from where it is configured to.
         scale: of the map's distances over those by wheels and sightings.
         count: landmarks that tell it.
     """
@@ -528,7 +528,7 @@ def coarse_fit(
     """
     p, r = complex_poses(path, seen.times)
     z = planar(seen.points, "body")
-    readings = {"": z, "map": z, **{kind: turn * z for kind, turn in LOOKS.items()}}
+    readings = {"": z, "map": z, "turn": z.conj(), **{kind: turn * z for kind, turn in LOOKS.items()}}
     if not seen.spatial:
         readings["bearings"] = z.conj()
     for width in _COARSE_S:
@@ -541,7 +541,7 @@ def coarse_fit(
             laid = [
                 (count, -misfit, scale)
                 for count, window in windows
-                for scale, misfit in zip(*_laid_on([window], places, 0, kind == "map"), strict=True)
+                for scale, misfit in zip(*_laid_on([window], places, 0, kind in ("map", "turn")), strict=True)
             ]
             if laid:
                 fits[kind] = max(laid)
@@ -563,7 +563,9 @@ def _clearest(fits: dict[str, tuple[int, float, float]]) -> CoarseFit | None:
     if least and fits[least][0] > 3 and misfits[least] < _COARSE_MISFIT and clear:
         sure = all(misfits[least] < _CLEARLY * misfits[kind] for kind in alike & misfits.keys() - {least})
         return CoarseFit(least if sure else "mirror", fits[least][2], fits[least][0])
-    if "" in fits and misfits[""] < (_COARSE_MISFIT if fits[""][0] > 3 else _COARSE_OF_THREE):
+    usual = misfits.get("", math.inf)
+    doubted = usual > _NO_DOUBT and misfits.get(least, math.inf) < _CLEARLY * usual
+    if usual < (_COARSE_MISFIT if fits[""][0] > 3 else _COARSE_OF_THREE) and not doubted:
         return CoarseFit("", fits[""][2], fits[""][0])
     return None
 

@@ -86,24 +86,27 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
     fits = [fit_sightings(one, turned).get("body") for one in (path, mirrored)]
     misfits = [math.inf if fit is None else fit.misfit for fit in fits]
     looks_back = fits[1] is not None and abs(se2.wrap(fits[1].yaw.value)) > _LOOKS_BACK_RAD
-    wheels = found.config.wheels
     if misfits[1] * _WORSE < misfits[0]:
-        lines: dict[str, Any] = {"wheels.scale_omega": -wheels.scale_omega}
-        if (drive := found.steered) is not None:
-            lines = {"wheels.drive.steering_ratio": -drive.steering_ratio}
-        elif wheels.track is not None:
-            lines = found.right_sides() or lines
         backwards = found.right_sides("reversed") if path.source == "ticks" else {}
         if backwards and looks_back:
             text = f"By gyro and landmarks the wheels {WRONG_SIDES['reversed']}"
             found.add("wheels.reversed", text, backwards)
             return True
-        found.add("wheels.sign", "The wheels turn in the opposite direction of gyro and landmarks, which agree", lines)
+        text = "The wheels turn in the opposite direction of gyro and landmarks, which agree"
+        found.add("wheels.sign", text, _other_turn(found))
         return True
     if misfits[0] * _WORSE < misfits[1]:
         text = "The gyro turns in the opposite direction of wheels and landmarks, which agree"
         found.add("imu.sign", text, {"gyro.scale": -found.config.gyro.scale})
     return False
+
+
+def _other_turn(found: Conventions) -> dict[str, Any]:
+    """Lines for wheels that turn the wrong way."""
+    wheels = found.config.wheels
+    if (drive := found.steered) is not None:
+        return {"wheels.drive.steering_ratio": -drive.steering_ratio}
+    return (found.right_sides() if wheels.track is not None else None) or {"wheels.scale_omega": -wheels.scale_omega}
 
 
 def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: float) -> Mounting | None:
@@ -505,6 +508,9 @@ def check_map(found: Conventions, path: Path, seen: Sightings | None) -> None:
     elif kind == "mirror":
         text = f"Map or bearings are a mirror image, by {count} landmarks: change the sign of all its y, or of bearings"
         found.add("map.mirrored", text)
+    elif kind == "turn":
+        text = f"The wheels turn the other way than map and sightings, which agree, by {count} landmarks"
+        found.add("wheels.sign", text, _other_turn(found))
     elif kind:
         turn = LOOKS.get(kind)
         R = rotation_to_base("body, upside down") if turn is None else rpy_matrix(0.0, 0.0, cmath.phase(turn))

@@ -420,8 +420,8 @@ def _dropped(result: RunData, rejections: Mapping[str, int], keyframes: int) -> 
                 )
             if 2 * rejections.get(f"{sensor}.unknown_id", 0) > count:
                 text = (
-                    f"{count} sightings of {sensor} were dropped ({reasons}): the map lacks their landmarks. `fgloc map "
-                    "BAG --anchor MAP.yaml --out MAP2.yaml` adds them to it."
+                    f"{count} sightings of {sensor} were dropped ({reasons}): the map lacks their landmarks. `fgloc "
+                    "map BAG --anchor MAP.yaml --out MAP2.yaml` adds them to it."
                 )
             yield Finding(f"{sensor}.dropped", text, Severity.WARNING if used else Severity.NOTE, value=float(count))
 

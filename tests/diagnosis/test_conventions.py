@@ -344,11 +344,11 @@ def test_on_a_straight_way_the_unit_of_ranges_or_of_the_wheels_are_both_told():
     assert "range_scale" in found["wheels.unit"].text
 
 
-def one_at_a_time(map_of=lambda place: place, seen_as=lambda away: away, every=1):
+def one_at_a_time(map_of=lambda place: place, seen_as=lambda away: away, turns=1.0, every=1):
     """Sightings of one beacon after the other, for ten seconds each, and settings and map: what `conventions` takes."""
     rng, some = np.random.default_rng(4), slice(None, None, 20)
     t, x, y, yaw = TIMES[some], X[some], Y[some], YAW[some]
-    motion = [odometry(s, twist=(v, w)) for s, v, w in zip(t, SPEED[some], RATE[some], strict=True)]
+    motion = [odometry(s, twist=(v, turns * w)) for s, v, w in zip(t, SPEED[some], RATE[some], strict=True)]
     which = (t / 10.0).astype(int)
     away = (BEACONS[which] - np.column_stack([x, y])) @ [1.0, 1j] * np.exp(-1j * yaw)
     away = seen_as(away + rng.normal(0.0, 0.01, len(t)) + 1j * rng.normal(0.0, 0.01, len(t)))
@@ -365,13 +365,18 @@ def one_at_a_time(map_of=lambda place: place, seen_as=lambda away: away, every=1
         ({"seen_as": np.conj}, "sightings.mirrored", 0.0),
         ({"seen_as": lambda away: 1j * away}, "sightings.mounting", -0.5 * math.pi),
         ({"seen_as": lambda away: -away}, "sightings.mounting", math.pi),
+        ({"turns": -1.0}, "wheels.sign", None),
     ],
 )
 def test_mirror_images_and_a_turned_sensor_are_named_where_the_wheels_alone_tell_nothing(
     monkeypatch, mistake, code, yaw
 ):
     monkeypatch.setattr("fgloc.diagnosis.landmarks.fit_sightings", lambda *_, **__: {})
-    (found,) = [f for f in conventions(*one_at_a_time(**mistake)).findings if f.code.startswith(("map.", "sightings."))]
+    (found,) = [
+        f
+        for f in conventions(*one_at_a_time(**mistake)).findings
+        if f.code.startswith(("map.", "sightings.", "wheels."))
+    ]
     assert (found.code, found.severity) == (code, Severity.ERROR)
     if yaw is not None:
         last = float(found.lines["recording.sightings_pose"].strip("[]").split(",")[-1])
