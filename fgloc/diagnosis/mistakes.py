@@ -35,9 +35,10 @@ from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors.base import with_values
+from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.markers.detector import RememberedDetections
-from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.wheels.sensor import mistakes
 from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
 
@@ -413,7 +414,8 @@ class Diagnosis:
             self._config = with_values(config, "recording", {"sightings_axes": "optical"})
             self._place = camera.T_base_cam
         sensor = LandmarkSensor(config, landmark_map, camera, T_base_sensor)  # what it refuses does not count
-        self._corners = SightingCollector(config, landmark_map, sensor, np.eye(4))  # corners are in the camera's axes
+        place = np.eye(4) if camera is None else camera.T_base_cam
+        self._corners = SightingCollector(config, landmark_map, sensor, place)  # they are in the camera's axes
         self._signals = SignalCollector(config)
         self._began_ns: int | None = None
         self._span_s, self._looked_s, self._compared_s = 0.0, -math.inf, 0.0
@@ -433,7 +435,16 @@ class Diagnosis:
         at_s = (event.stamp_ns - signals.origin_ns) * 1e-9
         if abs(at_s - self._looked_s) >= _SPARSE_S:
             self._looked_s, signals.spatial = at_s, True
-            signals.seen += [(at_s, s.landmark_id, *s.point.tolist()) for s in self._corners.sightings(event)]
+            signals.seen += [(at_s, i, *place.tolist()) for i, place in self._places(event)]
+
+    def _places(self, event: SightingsEvent) -> list[tuple[int, FloatArray]]:
+        """Id and place ``(3,)`` of markers in the camera's axes: without a map a run knows them in the base's plane."""
+        size = self._config.markers.default_size_m
+        if self._map is not None or self._camera is None or size is None:
+            return [(s.landmark_id, s.point) for s in self._corners.sightings(event)]
+        camera, seen = self._camera, [s for s in event.sightings if isinstance(s, MarkerCorners)]
+        found = ((s.landmark_id, marker_pose_candidates(camera, s.corners_px, size)) for s in seen)
+        return [(i, poses[0][0][:3, 3]) for i, poses in found if poses]
 
     def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
         """Watch the floor over a step.
