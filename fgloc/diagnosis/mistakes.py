@@ -262,7 +262,9 @@ class _Search:
                 self._setup.append(Finding(mistake.code, mistake.sentence, severity))
         if parts.landmark_map is None:
             return False
-        if self._unseen(excerpt, parts) and not self._images(recording, parts):
+        shown = self._shown(excerpt, parts)
+        unseen = len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
+        if unseen and not self._images(recording, parts, any(shown)):
             return False
         if self.config.markers.dictionary != parts.config.markers.dictionary:
             self.detections.clear()
@@ -270,17 +272,21 @@ class _Search:
         self._fit(recording, excerpt, parts)
         return False
 
-    def _unseen(self, excerpt: Excerpt, parts: SensorSetup) -> bool:
-        """Whether images were searched and next to none shows a marker of the map."""
-        assert parts.landmark_map is not None
-        shown = [any(m.landmark_id in parts.landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
-        return parts.detector is not None and len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
+    def _shown(self, excerpt: Excerpt, parts: SensorSetup) -> list[bool]:
+        """Whether each image that was searched shows a marker of the map."""
+        landmark_map = parts.landmark_map if parts.detector is not None else None
+        if landmark_map is None:
+            return []
+        return [any(m.landmark_id in landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
 
-    def _images(self, recording: Recording, parts: SensorSetup) -> bool:
-        """Report why no marker is found; whether another dictionary finds them."""
+    def _images(self, recording: Recording, parts: SensorSetup, shown: bool) -> bool:
+        """Report why next to no marker is found, or none is ``shown``; whether another dictionary finds them."""
         assert parts.detector is not None
         hints, fitting = parts.detector.hints(recording)
-        self._setup += note("markers.unseen" if fitting is None else "markers.dictionary", hints, Severity.ERROR)
+        vague = hints == (parts.detector.unseen,)  # the robot may begin where there are no markers
+        if not (vague and shown):
+            code, severity = "markers.unseen", Severity.WARNING if vague else Severity.ERROR
+            self._setup += note(code if fitting is None else "markers.dictionary", hints, severity)
         if fitting is not None:
             self._change("markers", dictionary=fitting)
         return fitting is not None
