@@ -59,12 +59,12 @@ class Outcome:
     @classmethod
     def of(cls, recording: Recording, parts: Assembly, replay: Replay, wrong: Mistakes) -> Outcome:
         """Collect the outcome from the parts of a run."""
-        hints = _hints(recording, parts, replay)
         rejections = replay.rejections()
         rejections.update({f"undecodable.{k}": v for k, v in recording.undecodable.items()})
         seen = sum(decision.landmark_id >= 0 for decision in replay.decisions)
+        hints = _hints(recording, parts, replay, seen)
         unused = unused_sightings(rejections, recording.roles, seen)
-        known = {finding.code for finding in wrong.findings}
+        known, said = ({getattr(finding, what) for finding in wrong.findings} for what in ("code", "text"))
         unread = (
             unread_map(recording, parts.config) if parts.landmark_map is not None and not recording.problems else None
         )
@@ -80,7 +80,7 @@ class Outcome:
             *note("floor.uneven", map(sentence, parts.diagnosis.mistakes), Severity.ERROR),
             *note("sightings.unused", map(sentence, unused), Severity.ERROR),
             *note("motion.model", map(sentence, parts.localizer.motion.mistakes), Severity.ERROR),
-            *note("setup.unseen", map(sentence, hints), Severity.WARNING),
+            *note("setup.unseen", (h for h in map(sentence, hints) if h not in said), Severity.WARNING),
             *(f for f in seen_in_images if f.code not in known),
             *_graded("recording", (*recording.notes, *recording.unreadable)),
             *note("clock", map(sentence, replay.clocks.notes)),
@@ -95,13 +95,14 @@ class Outcome:
         return " ".join([*mistakes, sentence(why) if mistakes else why, *hints])
 
 
-def _hints(recording: Recording, parts: Assembly, replay: Replay) -> list[str]:
-    """Reasons why nothing was received, or no marker was found."""
+def _hints(recording: Recording, parts: Assembly, replay: Replay, seen: int) -> list[str]:
+    """Reasons why nothing was received, or no marker was found; ``seen``: sightings that the estimator was given."""
     hints = [*replay.activity.missing()]
     if parts.detector is not None and not any(
         base_role(kind) in registry.detected_kinds() for kind, n in parts.localizer.counts.items() if n
     ):
-        hints = [*parts.detector.hints(recording)[0], *hints]
+        found = parts.detector.hints(recording)[0]
+        hints = [*(hint for hint in found if not (seen and hint == parts.detector.unseen)), *hints]
     return hints
 
 

@@ -15,7 +15,7 @@ from fgloc.config import CAMERA_ROLES, Config, Role, base_roles, camera_role
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES, OPTICAL_TO_BODY, homogeneous, rpy_matrix
-from fgloc.recording.reader import Recording
+from fgloc.recording.reader import Recording, is_rectified
 from fgloc.recording.transforms import FrameTree
 from fgloc.sensors import registry
 from fgloc.sensors.base import Context, Sensor, with_values
@@ -424,8 +424,10 @@ class OneCamera:
 
 
 def _camera(facts: StreamFacts, config: Config) -> Camera:
+    topic = facts.roles.get("image")
+    size = facts.image_size(topic)
     if facts.camera is not None:
-        return _fitting(facts.camera, facts, config)
+        return _fitting(facts.camera, size, facts.name, config)
     first = facts.first
     info, frame = first.get(CameraInfoEvent), camera_frame(first)
     T_base_cam = given_pose(config, default_axes="optical")
@@ -434,26 +436,26 @@ def _camera(facts: StreamFacts, config: Config) -> Camera:
     if config.camera.file is not None:
         camera = load_camera(config.camera.file, T_base_cam)
     elif isinstance(info, CameraInfoEvent):
-        camera = camera_from_info(info, T_base_cam)
+        camera = camera_from_info(info, T_base_cam, size, is_rectified(topic or ""))
     else:
         raise CameraError(
             f"{facts.name}: images or marker corners, but no sensor_msgs/CameraInfo; "
             "set camera.file to a calibration YAML in --config"
         )
-    return _fitting(camera, facts, config)
+    return _fitting(camera, size, facts.name, config)
 
 
-def _fitting(camera: Camera, facts: StreamFacts, config: Config) -> Camera:
+def _fitting(camera: Camera, size: tuple[int, int] | None, name: str, config: Config) -> Camera:
     """The camera as the configuration corrects it, for the size of the images."""
-    size = facts.image_size(facts.roles.get("image"))
     if size is None or not camera.width or size == (camera.width, camera.height):
         return corrected(camera, config.camera)
+    scaled = rescaled(camera, *size)
     if not config.camera.rescale:
         raise CameraError(
-            f"{facts.name}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
+            f"{name}: images are {size[0]}x{size[1]}, the calibration is for {camera.width}x{camera.height}; "
             "calibrate at this size, or set expert.camera.rescale: true"
         )
-    return corrected(rescaled(camera, *size), config.camera)
+    return corrected(scaled, config.camera)
 
 
 def _mounted_imu(facts: StreamFacts, config: Config) -> FloatArray:

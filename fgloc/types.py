@@ -173,6 +173,15 @@ class CameraInfoEvent(Event):
     distortion_model: str
     K: FloatArray  # (3, 3)
     D: FloatArray  # (n,)
+    P: FloatArray | None = None  # (3, 4) of the rectified image
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)  # x, y, width, height of the part that images show; 0: all of it
+    binning: tuple[int, int] = (1, 1)  # pixels of the calibration to one of the images, across and down
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the images, where they are a part of what was calibrated, or binned."""
+        _, _, width, height = self.roi
+        return (width or self.width) // self.binning[0], (height or self.height) // self.binning[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

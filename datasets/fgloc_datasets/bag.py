@@ -335,8 +335,9 @@ class BagWriter(LandmarkMessages):
         D: Sequence[float],
         received_ns: int | None = None,
         frame_id: str = "camera_optical",
+        **fields: Any,
     ) -> None:
-        """``sensor_msgs/CameraInfo`` of an unrectified camera (plumb_bob): width and height, K (3, 3), D (n,)."""
+        """``sensor_msgs/CameraInfo`` (plumb_bob): width and height, K (3, 3), D (n,); other fields as given."""
         matrix = np.asarray(K, dtype=float).reshape(3, 3)
         projection = np.zeros((3, 4))
         projection[:, :3] = matrix
@@ -349,6 +350,7 @@ class BagWriter(LandmarkMessages):
             r=np.eye(3).ravel(),
             p=projection.ravel(),
         )
+        content |= fields
         self._write(topic, "sensor_msgs/msg/CameraInfo", stamp_ns, received_ns, frame_id, content)
 
     def static_transform(

@@ -34,7 +34,7 @@ from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
 from fgloc.recording.fields import NumericField, unread_numbers
 from fgloc.recording.info import LACKING, RecordingInfo, inspect_recording, placing_roles
-from fgloc.recording.reader import POINT, TF_TYPES, Recording, converters_of, is_derived
+from fgloc.recording.reader import POINT, TF_TYPES, Recording, converters_of, is_derived, unrectified
 from fgloc.recording.storage import Storage, find_beside
 from fgloc.sensor_setup import recorded_setup
 from fgloc.sensors import registry
@@ -348,7 +348,9 @@ def _with_cameras(bag: Path, config: Config) -> Config:
     of_poses = [frozenset({kind}) for kind in converters_of("sightings") if kind not in {*_CORNERS, _RANGE_BEARING}]
     for role, kinds in (("image", _IMAGES), *(("sightings", kinds) for kinds in (_CORNERS, *of_poses))):
         there = [t.name for t in topics if t.message_type in kinds and not is_derived(t.name)]
-        plain = [name for name in there if name.removesuffix("/compressed") not in there or "/compressed" not in name]
+        plain = unrectified(
+            [name for name in there if name.removesuffix("/compressed") not in there or "/compressed" not in name]
+        )
         if len(plain) > 1:
             cameras = {name: {role: topic} for name, topic in zip(_names(plain), plain, strict=True)}
             return config_of({"cameras": cameras})

@@ -118,6 +118,7 @@ def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
         for event in _checked(recording, parts, unreadable, progress):
             if isinstance(event, SightingsEvent) and event.in_pixels:
                 seen.update(s.landmark_id for s in event.sightings)
+            parts.diagnosis.add(event)
             for step in parts.stepper.push(event):
                 parts.localizer.update(step)
         for step in parts.stepper.flush():
@@ -646,7 +647,8 @@ class Survey:
         left_out: markers that were seen but are not in the map, with the reason.
         installation: what was found besides, by name.
         notes: what the user should know, one sentence each.
-        errors: sentences on what was given and cannot be true: the map is not to be trusted.
+        errors: sentences on what was given and cannot be true, or why most markers are left out: the map is not to be
+            trusted.
     """
 
     landmarks: LandmarkMap
@@ -693,10 +695,9 @@ def survey(
     graph.solve()
     surveyed, views = graph.landmarks(), graph.views
     left_out |= _undetermined(graph, surveyed, views, set(anchors), config.landmarks.min_sightings)
-    if not set(surveyed) - set(left_out):
-        listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
-        raise RecordingError(f"{bags[0]}: no marker can be surveyed: {listed}")
     kept = {i: m for i, m in surveyed.items() if i not in left_out}
+    if not kept:
+        raise _none_surveyed(drives, left_out)
     unseen = {i: m for i, m in (given.landmarks if given is not None else {}).items() if i not in kept}
     dictionary = config.markers.dictionary or (given.dictionary if given is not None else "")
     landmarks = LandmarkMap(dict(sorted((kept | unseen).items())), dictionary, "surveyed")
@@ -706,8 +707,18 @@ def survey(
     notes += [f"Markers {sorted(unseen)} of the given map were not seen, and stay as given."] if unseen else []
     misfits = [(d, graph.misfit(d)) for d in distances]
     notes += [_missed(d, sigmas) for d, sigmas in misfits if sigmas > _CONTRADICTS]
-    errors = tuple(_moved(graph, sorted(anchors & kept.keys())))
+    errors = (*_moved(graph, sorted(anchors & kept.keys())), *(_wrong(drives) if len(left_out) > len(kept) else ()))
     return Survey(landmarks, {i: views[i] for i in kept}, left_out, found, tuple(dict.fromkeys(notes)), errors)
+
+
+def _none_surveyed(drives: Sequence[Drive], left_out: Mapping[int, str]) -> RecordingError:
+    listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items()) or "none was seen"
+    return RecordingError(" ".join([f"{drives[0].bag}: no marker can be surveyed: {listed}.", *_wrong(drives)]))
+
+
+def _wrong(drives: Sequence[Drive]) -> dict[str, None]:
+    """Sentences on signals of the drives that do not fit together, as where the camera is mounted otherwise."""
+    return dict.fromkeys(finding.text for one in drives for finding in one.parts.diagnosis.findings())
 
 
 def _moved(graph: SurveyGraph, markers: Iterable[int]) -> Iterator[str]:
@@ -791,8 +802,7 @@ def _joined(
         agreeing = {i: g.agreeing for i, g in guesses.items()}
         legs.append(Leg(one, se2.compose_array(motion, one.poses), agreeing, free))
     if not known:
-        listed = "; ".join(f"marker {i}: {why}" for i, why in left_out.items())
-        raise RecordingError(f"{drives[0].bag}: no marker can be surveyed: {listed or 'none was seen'}")
+        raise _none_surveyed(drives, left_out)
     start = {
         i: anchors[i] if i in anchors else Landmark(i, T[:3, 3], T[:3, :3], sizes[i]) for i, T in sorted(known.items())
     }

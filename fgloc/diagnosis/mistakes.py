@@ -35,9 +35,10 @@ from fgloc.recording.info import RecordingInfo, inspect_recording
 from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors.base import with_values
+from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.markers.detector import RememberedDetections
-from fgloc.sensors.markers.images import CornersEvent
+from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.wheels.sensor import mistakes
 from fgloc.types import Camera, Event, Finding, FloatArray, LandmarkMap, Severity, SightingsEvent, Step, note, ordered
 
@@ -261,7 +262,9 @@ class _Search:
                 self._setup.append(Finding(mistake.code, mistake.sentence, severity))
         if parts.landmark_map is None:
             return False
-        if self._unseen(excerpt, parts) and not self._images(recording, parts):
+        shown = self._shown(excerpt, parts)
+        unseen = len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
+        if unseen and not self._images(recording, parts, any(shown)):
             return False
         if self.config.markers.dictionary != parts.config.markers.dictionary:
             self.detections.clear()
@@ -269,17 +272,21 @@ class _Search:
         self._fit(recording, excerpt, parts)
         return False
 
-    def _unseen(self, excerpt: Excerpt, parts: SensorSetup) -> bool:
-        """Whether images were searched and next to none shows a marker of the map."""
-        assert parts.landmark_map is not None
-        shown = [any(m.landmark_id in parts.landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
-        return parts.detector is not None and len(shown) >= _FEWEST_IMAGES and sum(shown) < _MARKER_SHARE * len(shown)
+    def _shown(self, excerpt: Excerpt, parts: SensorSetup) -> list[bool]:
+        """Whether each image that was searched shows a marker of the map."""
+        landmark_map = parts.landmark_map if parts.detector is not None else None
+        if landmark_map is None:
+            return []
+        return [any(m.landmark_id in landmark_map for m in p.seen) for row in excerpt.pictures for p in row]
 
-    def _images(self, recording: Recording, parts: SensorSetup) -> bool:
-        """Report why no marker is found; whether another dictionary finds them."""
+    def _images(self, recording: Recording, parts: SensorSetup, shown: bool) -> bool:
+        """Report why next to no marker is found, or none is ``shown``; whether another dictionary finds them."""
         assert parts.detector is not None
         hints, fitting = parts.detector.hints(recording)
-        self._setup += note("markers.unseen" if fitting is None else "markers.dictionary", hints, Severity.ERROR)
+        vague = hints == (parts.detector.unseen,)  # the robot may begin where there are no markers
+        if not (vague and shown):
+            code, severity = "markers.unseen", Severity.WARNING if vague else Severity.ERROR
+            self._setup += note(code if fitting is None else "markers.dictionary", hints, severity)
         if fitting is not None:
             self._change("markers", dictionary=fitting)
         return fitting is not None
@@ -413,7 +420,8 @@ class Diagnosis:
             self._config = with_values(config, "recording", {"sightings_axes": "optical"})
             self._place = camera.T_base_cam
         sensor = LandmarkSensor(config, landmark_map, camera, T_base_sensor)  # what it refuses does not count
-        self._corners = SightingCollector(config, landmark_map, sensor, np.eye(4))  # corners are in the camera's axes
+        place = np.eye(4) if camera is None else camera.T_base_cam
+        self._corners = SightingCollector(config, landmark_map, sensor, place)  # they are in the camera's axes
         self._signals = SignalCollector(config)
         self._began_ns: int | None = None
         self._span_s, self._looked_s, self._compared_s = 0.0, -math.inf, 0.0
@@ -433,7 +441,16 @@ class Diagnosis:
         at_s = (event.stamp_ns - signals.origin_ns) * 1e-9
         if abs(at_s - self._looked_s) >= _SPARSE_S:
             self._looked_s, signals.spatial = at_s, True
-            signals.seen += [(at_s, s.landmark_id, *s.point.tolist()) for s in self._corners.sightings(event)]
+            signals.seen += [(at_s, i, *place.tolist()) for i, place in self._places(event)]
+
+    def _places(self, event: SightingsEvent) -> list[tuple[int, FloatArray]]:
+        """Id and place ``(3,)`` of markers in the camera's axes: without a map a run knows them in the base's plane."""
+        size = self._config.markers.default_size_m
+        if self._map is not None or self._camera is None or size is None:
+            return [(s.landmark_id, s.point) for s in self._corners.sightings(event)]
+        camera, seen = self._camera, [s for s in event.sightings if isinstance(s, MarkerCorners)]
+        found = ((s.landmark_id, marker_pose_candidates(camera, s.corners_px, size)) for s in seen)
+        return [(i, poses[0][0][:3, 3]) for i, poses in found if poses]
 
     def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
         """Watch the floor over a step.

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fgloc.config import BUILT_IN_ROLES, Config, Role, base_role, base_roles
+from fgloc.config import BUILT_IN_ROLES, CAMERA_ROLES, Config, Role, base_role, base_roles, camera_role
 from fgloc.errors import RecordingError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
@@ -216,20 +216,20 @@ class CameraInfoChecks:
     """A calibration that is none, or that changes."""
 
     def __init__(self) -> None:
-        self.size = (0, 0)
+        self.sizes = ((0, 0), (0, 0))  # of the calibration, and of the images by it
         self.frame_id = ""
-        self._zero = 0
+        self.zero = 0
         self._no_distortion = 0
-        self._count = 0
+        self.count = 0
         self._calibrations: set[bytes] = set()
 
     def add(self, event: Event) -> None:
         """Add one event."""
         assert isinstance(event, CameraInfoEvent)
-        self._count += 1
-        self.size = event.width, event.height
+        self.count += 1
+        self.sizes = (event.width, event.height), event.image_size
         self.frame_id = self.frame_id or event.frame_id
-        self._zero += not event.K.any()
+        self.zero += not event.K.any()
         self._no_distortion += len(event.D) == 0
         if len(self._calibrations) < 10:
             self._calibrations.add(event.K.tobytes() + event.D.tobytes())
@@ -237,12 +237,7 @@ class CameraInfoChecks:
     def findings(self, topic: str, seconds: FloatArray, config: Config) -> list[str]:
         """Faults that were found, one sentence each."""
         found = []
-        if self._zero:
-            found.append(
-                f"{topic}: K is all zero in {self._zero} of {self._count} messages: the camera is not calibrated; "
-                "give a calibration (camera.file in the configuration)."
-            )
-        elif self._no_distortion:
+        if self._no_distortion and not self.zero:
             found.append(f"{topic}: no distortion coefficients; they are taken as zero.")
         if len(self._calibrations) > 1:
             found.append(f"{topic}: the calibration changes during the recording; the first one is used.")
@@ -385,7 +380,7 @@ def _roles(
 ) -> Iterator[Finding]:
     """Roles that a run needs and the recording lacks."""
     roles = recording.roles
-    motion, place, uncalibrated, size, unmounted = LACKING
+    motion, place, *_ = LACKING
     unsettled = bool(recording.problems)
     if not unsettled and not {"odometry", "joints", "command"} & roles.keys():
         told = "sightings alone tell" if {"image", "sightings"} & base_roles(roles) else "nothing measures"
@@ -397,23 +392,36 @@ def _roles(
     if not unsettled and not placing_roles(roles, config):
         text = "No images and no marker sightings: nothing bounds the drift." + _perhaps_sightings(recording)
         yield Finding(place, text, Severity.WARNING)
-    images = next((c for c in checks.values() if isinstance(c, RawChecks)), None)
-    info = next((c for c in checks.values() if isinstance(c, CameraInfoChecks)), None)
-    sightings = next((c for c in checks.values() if isinstance(c, SightingsChecks)), None)
-    needs_camera = images is not None or (sightings is not None and sightings.in_pixels)
-    if needs_camera and info is None and config.camera.file is None:
-        text = "No sensor_msgs/CameraInfo for the camera; give a calibration (camera.file in the configuration)."
+    for name in config.camera_names:
+        own = {role: topic for role in CAMERA_ROLES if (topic := roles.get(camera_role(name, role)))}
+        yield from _camera(recording, config.of_camera(name), own, checks, child_frame)
+
+
+def _camera(
+    recording: Recording, config: Config, own: Mapping[Role, str], checks: Mapping[str, Collector], child_frame: str
+) -> Iterator[Finding]:
+    """Calibration, resolution and place that one of the cameras needs and the recording lacks, by its own topics."""
+    _, _, uncalibrated, size, unmounted = LACKING
+    images, info, sightings = (checks.get(own.get(role, "")) for role in ("image", "camera_info", "sightings"))
+    needs_camera = isinstance(images, RawChecks) or (isinstance(sightings, SightingsChecks) and sightings.in_pixels)
+    calibrations = info if isinstance(info, CameraInfoChecks) else None
+    if needs_camera and config.camera.file is None and (calibrations is None or calibrations.zero):
+        lacking = "No sensor_msgs/CameraInfo for the camera"
+        if calibrations is not None:
+            times = f"{calibrations.zero} of {calibrations.count} messages"
+            lacking = f"{own['camera_info']}: K is all zero in {times}: the camera is not calibrated"
+        text = f"{lacking}; give a calibration (camera.file in the configuration)."
         yield Finding(uncalibrated, text, Severity.WARNING)
-    if images is not None and info is not None and images.sizes and info.size not in images.sizes:
-        sizes = ", ".join(f"{w}x{h}" for w, h in images.sizes)
-        text = f"{roles['camera_info']}: the calibration is for {info.size[0]}x{info.size[1]}, the images are {sizes}."
+    by_info = () if calibrations is None else calibrations.sizes
+    if by_info and isinstance(images, RawChecks) and images.sizes and not images.sizes.keys() & {*by_info}:
+        sizes, (width, height) = ", ".join(f"{w}x{h}" for w, h in images.sizes), by_info[0]
+        text = f"{own['camera_info']}: the calibration is for {width}x{height}, the images are {sizes}."
         yield Finding(size, text, Severity.WARNING)
-    if config.recording.sightings_pose is None:
-        sensors = (info, images, sightings) if needs_camera else (sightings,)
-        frames = [sensor.frame_id for sensor in sensors if sensor is not None]
-        if frames:
-            bases, frame = _base_names(config, child_frame), next(filter(None, frames), "")
-            yield from note(unmounted, _mounting(recording, bases, frame, needs_camera), Severity.WARNING)
+    sensors = (calibrations, images, sightings) if needs_camera else (sightings,)
+    frames = [one.frame_id for one in sensors if isinstance(one, CameraInfoChecks | RawChecks | SightingsChecks)]
+    if config.recording.sightings_pose is None and frames:
+        bases, frame = _base_names(config, child_frame), next(filter(None, frames), "")
+        yield from note(unmounted, _mounting(recording, bases, frame, needs_camera), Severity.WARNING)
 
 
 def _perhaps_odometry(recording: Recording) -> str:

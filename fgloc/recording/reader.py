@@ -95,8 +95,12 @@ class MessageEvents:
 
 
 def _camera_info(m: Any, when: When) -> Event:
-    K, D = (m.K, m.D) if hasattr(m, "K") else (m.k, m.d)  # ROS 1 has capitals
-    return CameraInfoEvent(*when, m.header.frame_id, m.width, m.height, m.distortion_model, matrix(K, 3), vector(D))
+    K, D, P = (m.K, m.D, m.P) if hasattr(m, "K") else (m.k, m.d, m.p)  # ROS 1 has capitals
+    roi = m.roi.x_offset, m.roi.y_offset, m.roi.width, m.roi.height
+    binning = max(m.binning_x, 1), max(m.binning_y, 1)
+    projection = vector(P).reshape(3, 4)
+    arrays = matrix(K, 3), vector(D), projection
+    return CameraInfoEvent(*when, m.header.frame_id, m.width, m.height, m.distortion_model, *arrays, roi, binning)
 
 
 def _truth(position: str, orientation: str) -> Converter:
@@ -153,9 +157,10 @@ _NOT_TRUTH = re.compile(
     re.IGNORECASE,
 )
 _NOT_IMAGE = re.compile(
-    r"(?<![a-z])((compressed)?depth|disparity|confidence|mask|debug|result|overlay|rect(ified)?|costmap)(?![a-z])",
+    r"(?<![a-z])((compressed)?depth|disparity|confidence|mask|debug|result|overlay|costmap)(?![a-z])",
     re.IGNORECASE,
 )
+_RECTIFIED = re.compile(r"(?<![a-z])rect(ified)?(?![a-z])", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +203,7 @@ def select_roles(
         taken = (*roles.values(), *also, *config.of_joints)
         fitting = [topic for topic in filled if _fits(role, topic) and topic.name not in taken]
         whole = [topic.name for topic in fitting if topic.message_type not in (_TRANSFORM, POINT, _TWIST)]
-        candidates = whole or [topic.name for topic in fitting]
+        candidates = unrectified(whole or [topic.name for topic in fitting])
         camera = role.rpartition("/")[0]
         near = roles.get(camera_role(camera, "image")) or roles.get(camera_role(camera, "sightings"))
         if role in config.of_cameras:  # a calibration that is not beside its images may be of any camera
@@ -287,6 +292,16 @@ def _unnumbered(topic: str) -> str:
 def is_derived(topic: str) -> bool:
     """Whether the name of a topic of images says that they are of no camera: depth, a mask, an overlay."""
     return bool(_NOT_IMAGE.search(topic))
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether the name of a topic of images says that the lens's distortion is taken out of them."""
+    return bool(_RECTIFIED.search(topic))
+
+
+def unrectified(topics: list[str]) -> list[str]:
+    """Those of some topics that are as the camera gives them; all, where there is none."""
+    return [name for name in topics if not is_rectified(name)] or topics
 
 
 def topic_key(role: Role) -> str:

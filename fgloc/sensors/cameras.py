@@ -25,16 +25,34 @@ _UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
 _LARGEST_PX = 100_000  # no camera has more on a side
 
 
-def camera_from_info(event: CameraInfoEvent, T_base_cam: FloatArray) -> Camera:
+def camera_from_info(
+    event: CameraInfoEvent, T_base_cam: FloatArray, size: tuple[int, int] | None = None, rectified: bool = False
+) -> Camera:
     """The camera that a CameraInfo describes, mounted at ``T_base_cam (4, 4)``.
+
+    Args:
+        event: the message.
+        T_base_cam: mounting of the optical frame.
+        size: width and height of the images, which tell whether its region of interest and its binning are theirs;
+            None: not known, they are.
+        rectified: whether the images have no distortion: their focal length and principal point are those of P.
 
     Raises:
         CameraError: K is zeros, not finite or has no positive focal length; unknown or impossible distortion.
+
+    Source: sensor_msgs/CameraInfo, whose K, P, width and height are of the full resolution.
     """
-    source = f"{event.topic} (CameraInfo)"
-    return _checked(
-        source, (event.width, event.height), event.distortion_model, event.K, event.D, T_base_cam, event.frame_id
-    )
+    K, D = np.array(event.K, dtype=np.float64), event.D
+    if rectified and event.P is not None and event.P[:, :3].any():
+        K, D = event.P[:, :3].copy(), np.zeros(4)
+    full = event.width, event.height
+    if size in (None, event.image_size) and event.image_size != full:
+        first, share = np.array(event.roi[:2]), np.array(event.binning)
+        K[:2, 2] = (K[:2, 2] - first + 0.5) / share - 0.5  # pixel centers are at whole numbers
+        K[[0, 1], [0, 1]] /= share
+        full = event.image_size
+    model = "" if D is not event.D else event.distortion_model
+    return _checked(f"{event.topic} (CameraInfo)", full, model, K, D, T_base_cam, event.frame_id)
 
 
 def load_camera(path: Path, T_base_cam: FloatArray, name: str | None = None) -> Camera:
@@ -186,7 +204,7 @@ def _checked(
     if not all(0 <= side <= _LARGEST_PX for side in size):
         raise CameraError(f"{source}: an image of {size[0]}x{size[1]} pixels; expected 0 to {_LARGEST_PX} on a side")
     if not matrix.any():
-        raise CameraError(f"{source}: the camera matrix K is all zeros: the camera is not calibrated; calibrate it")
+        raise CameraError(f"{source}: the camera matrix K is all zeros: the camera is not calibrated; give camera.file")
     if not (np.isfinite(matrix).all() and np.isfinite(coefficients).all()):
         raise CameraError(f"{source}: K or D is not finite: K {matrix.ravel().tolist()}, D {coefficients.tolist()}")
     if matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0 or matrix[2].tolist() != [0.0, 0.0, 1.0]:

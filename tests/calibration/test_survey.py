@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 from refusal import refusal
-from robot_world import CAMERA, SIGMA_PX, World, config, project, room, standing, truth_at
+from robot_world import CAMERA, SIGMA_PX, T_BASE_CAM, World, config, project, room, standing, truth_at
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 from world_bags import write_world
@@ -159,6 +159,16 @@ def test_of_given_markers_the_one_that_is_moved_most_is_named_if_it_is_moved_too
     assert not survey([short_bag], settings(), LandmarkMap(given, "DICT_4X4_50")).errors
     (error,) = survey([short_bag], settings(), LandmarkMap(wrong, "DICT_4X4_50")).errors
     assert "marker 3 " in error
+
+
+def test_a_camera_without_an_optical_frame_is_named_where_no_map_comes_of_it(bag, found):
+    forward = {"sightings_pose": (*T_BASE_CAM[:3, 3], 0.0, 0.0, 0.0), "sightings_axes": "body"}
+    assert not found.errors
+    try:
+        said = survey([bag], settings(recording=forward)).errors
+    except RecordingError as error:
+        said = (str(error),)
+    assert [text for text in said if "recording.sightings_axes: optical" in text], said
 
 
 def test_given_markers_that_cannot_be_where_they_are_said_to_be_are_named(bag, tmp_path):

@@ -26,7 +26,7 @@ from robot_world import (
 
 from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
-from fgloc.config import TopicsConfig, config_of_file, load_config
+from fgloc.config import TopicsConfig, config_of_file, load_config, with_value
 from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.frames import yaw_quaternion
 from fgloc.recording.reader import TopicInfo, select_roles
@@ -232,6 +232,18 @@ def test_fault_46_wrong_transform_of_the_camera(given):
     (line,) = [f.lines["recording.sightings_pose"] for f in found.values()]
     suggested = given_pose(config(recording={"sightings_pose": yaml.safe_load(line)}), "optical")
     np.testing.assert_allclose(suggested[:3, :3], T_BASE_CAM[:3, :3], atol=0.05)
+
+
+@pytest.mark.parametrize(("turn", "named"), [(np.eye(3), []), (T_BASE_CAM[:3, :3].T, ["sightings.axes"])])
+def test_fault_46_without_a_map_places_of_markers_are_in_the_axes_of_their_camera(turn, named):
+    given = T_BASE_CAM.copy()
+    given[:3, :3] = turn @ given[:3, :3]
+    camera = dataclasses.replace(CAMERA, T_base_cam=given)
+    sized = with_value(config(), "markers.default_size_m", 0.25)
+    found = diagnose(events(room(), corners=True), None, camera, sized)
+    assert list(found) == named
+    if named:
+        assert found["sightings.axes"].lines["recording.sightings_axes"] == "optical"
 
 
 @pytest.mark.parametrize(

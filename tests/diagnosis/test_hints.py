@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from fgloc.config import Config, RecordingConfig
+from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.errors import EstimatorError
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
 from fgloc.sensors.markers.images import ImageEvent, decode
+from fgloc.types import Severity
 from fgloc_datasets.bag import BagWriter
 
 SAMPLE = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples" / "first_run"
@@ -59,3 +61,19 @@ def test_fault_42_wrong_dictionary_is_named_and_the_fitting_one_taken(tmp_path, 
     assert result.mistakes == result.notes[:1]
     assert result.config.markers.dictionary == "DICT_4X4_50"
     assert result.counts["corners"]
+
+
+@pytest.mark.parametrize(
+    ("change", "codes"), [(lambda image: image // 40, ["setup.unseen"]), (lambda image: image, [])]
+)
+def test_a_run_without_a_map_tells_of_images_that_show_no_marker(tmp_path, pictures, change, codes):
+    bag = short_bag(tmp_path, pictures, change)
+    sized = Config.model_validate({"markers": {"dictionary": "DICT_4X4_50", "default_size_m": 0.2}})
+    found = run(bag, None, sized, "batch").findings
+    assert [f.code for f in found if f.severity is Severity.WARNING and "unseen" in f.code] == codes
+
+
+def test_info_with_a_map_tells_of_images_that_show_no_marker(tmp_path, pictures):
+    bag = short_bag(tmp_path, pictures, lambda image: image // 40)
+    found = inspect_all(bag, SAMPLE / "map.yaml", Config())
+    assert [f.severity for f in found.found if f.code == "markers.unseen"] == [Severity.WARNING]

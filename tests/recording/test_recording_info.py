@@ -188,6 +188,24 @@ def test_fault_37_zero_calibration_is_reported(tmp_path):
     one(info, "/camera/camera_info", "K ", "10 of 10", "camera.file")
 
 
+def test_fault_39_each_of_several_cameras_is_held_against_its_own_calibration(tmp_path):
+    with BagWriter(tmp_path / "run") as bag:
+        stamp, m = bag.make("builtin_interfaces/msg/Time", sec=START_NS // 10**9, nanosec=0), bag.make
+        bag.odometry("/odom", START_NS, (0, 0, 0), (1, 0), covs=(np.eye(6), np.eye(6)))
+        for name, width, focal in (("front", 64, 50.0), ("rear", 32, 0.0)):
+            header, pixels = m("std_msgs/msg/Header", stamp=stamp, frame_id=name), np.zeros(48 * width, np.uint8)
+            shape = dict(height=48, width=width, encoding="mono8", is_bigendian=0, step=width)
+            image = m("sensor_msgs/msg/Image", header=header, **shape, data=pixels)
+            bag.write(f"/{name}/image_raw", "sensor_msgs/msg/Image", image, START_NS)
+            K = np.diag([focal, focal, min(focal, 1.0)])
+            bag.camera_info(f"/{name}/camera_info", START_NS, (64, 48), K, [0.0] * 5, frame_id=name)
+            bag.static_transform(START_NS, "base_link", name, (0, 0, 0), (0, 0, 0, 1))
+    cameras = {name: {"image": f"/{name}/image_raw"} for name in ("front", "rear")}
+    info = inspect(tmp_path / "run", config_of({"cameras": cameras}))
+    for code in ("camera.uncalibrated", "camera.resolution"):
+        assert one(info, code).startswith("/rear/camera_info: ")
+
+
 def test_truth_in_bursts_and_blackouts_are_reported(tmp_path):
     with BagWriter(tmp_path / "run") as bag:
         for k in range(400):

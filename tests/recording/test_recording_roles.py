@@ -53,6 +53,8 @@ def select(*topics: tuple[str, str], empty: tuple[tuple[str, str], ...] = (), **
             [("/camera/depth/image_raw", IMAGE), ("/camera/color/image_raw", IMAGE)],
             {"image": "/camera/color/image_raw"},
         ),
+        ([("/zed/left/image_rect_color", IMAGE)], {"image": "/zed/left/image_rect_color"}),
+        ([("/camera/image_rect", IMAGE), ("/camera/image_color", IMAGE)], {"image": "/camera/image_color"}),
         ([("/direct/image", IMAGE), ("/tags", TAGS)], {"sightings": "/tags"}),
         (
             [("/left/image_raw/compressed", COMPRESSED), ("/left/camera_info", INFO), ("/right/camera_info", INFO)],

@@ -30,12 +30,14 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}
 """
 
 
-def write_bag(folder, motion=True, info=(640, 480), image=(640, 480), camera_frame="camera_optical", sightings=False):
-    """A short recording; ``info`` and ``image`` are sizes or None."""
+def write_bag(
+    folder, motion=True, info=(640, 480), image=(640, 480), camera_frame="camera_optical", sightings=False, **fields
+):
+    """A short recording; ``info`` and ``image`` are sizes or None, ``fields`` those of CameraInfo."""
     with BagWriter(folder / "bag") as bag:
         bag.static_transform(START_NS, "base_link", "camera_optical", (0.1, 0.0, 0.3), OPTICAL)
         if info is not None:
-            bag.camera_info("/camera/camera_info", START_NS, info, K, [0.0] * 5, frame_id=camera_frame)
+            bag.camera_info("/camera/camera_info", START_NS, info, K, [0.0] * 5, frame_id=camera_frame, **fields)
         for k in range(20):
             stamp = START_NS + k * 50_000_000
             if motion:
@@ -90,6 +92,16 @@ def test_fault_36_a_calibration_file_stands_in(tmp_path):
 def test_fault_39_another_image_size_is_refused(tmp_path):
     with pytest.raises(CameraError, match=r"\b320x240\b.*\b640x480\b.*camera\.rescale"):
         build(tmp_path, image=(320, 240))
+
+
+def test_fault_39_images_of_another_shape_are_not_to_be_rescaled(tmp_path):
+    with refusal(CameraError, "640x360", "crop"):
+        build(tmp_path, image=(640, 360))
+
+
+def test_fault_39_binned_images_have_the_calibration_of_all_pixels(tmp_path):
+    camera = build(tmp_path, image=(320, 240), binning_x=2, binning_y=2).landmarks._context.camera
+    assert (camera.width, camera.height, camera.K[0, 0]) == (320, 240, 250.0)
 
 
 def test_fault_39_rescaled_on_request(tmp_path):

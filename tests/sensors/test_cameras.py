@@ -44,6 +44,31 @@ def test_camera_info_gives_the_camera() -> None:
     assert c.D.tolist() == [0.1, 0.2, 0.3, 0.4, 0.0]
 
 
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((280, 160), (262.5, 260.0, 139.5, 79.5)),
+        (None, (262.5, 260.0, 139.5, 79.5)),
+        ((640, 480), (525, 520, 319.5, 239.5)),
+    ],
+)
+def test_fault_39_calibration_of_all_pixels_for_images_of_a_part_of_them(size, expected) -> None:
+    part = replace(info(), roi=(40, 80, 560, 320), binning=(2, 2))
+    c = camera_from_info(part, T, size)
+    assert (c.width, c.height) == (size or (280, 160))
+    assert (c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]) == pytest.approx(expected)
+
+
+def test_rectified_images_have_the_projection_and_no_distortion() -> None:
+    P = np.hstack([np.diag([480.0, 481.0, 1.0]), np.zeros((3, 1))])
+    raw = replace(info(D=(0.1, 0.2, 0.3, 0.4, 0.5)), P=P)
+    assert camera_from_info(raw, T).K[0, 0] == 525.0
+    c = camera_from_info(raw, T, rectified=True)
+    assert c.K.tolist() == P[:, :3].tolist()
+    assert not c.D.any()
+    assert camera_from_info(replace(raw, P=np.zeros((3, 4))), T, rectified=True).D.any()  # it has no projection
+
+
 def test_fault_37_matrix_all_zeros() -> None:
     with pytest.raises(CameraError, match=r"/camera/camera_info.*all zeros.*not calibrated"):
         camera_from_info(info(np.zeros((3, 3))), T)

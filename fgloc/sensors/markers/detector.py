@@ -196,6 +196,10 @@ class MarkerDetector:
         """
         self._config = config
         self.dictionary = dictionary
+        self.unseen = (
+            f"No image that was looked at shows a marker of {dictionary}: they are dark or blurred, or the markers are "
+            "absent, too small or of another dictionary."
+        )
         self._dictionary = load_dictionary(dictionary)
         self._cells = int(self._dictionary.markerSize) + 2
         self._turn = 2 if turned_by_180(dictionary) else 0
@@ -220,13 +224,14 @@ class MarkerDetector:
         """Hints on why no marker is found, a sentence each: another dictionary, mirrored images, inverted prints.
 
         Returns:
-            The sentences; and the dictionary, if it is another one.
+            The sentences, `unseen` where nothing else is known; and the dictionary, if it is another one.
         """
         images = _some_images(recording)
         hints = list(dict.fromkeys(hint for image in images for hint in self.diagnose(image)))
-        fitting = None if any(self.find(image) for image in images) else suggest_dictionary(images)
+        found = any(self.find(image) for image in images)
+        fitting = None if found else suggest_dictionary(images)
         if fitting is None or fitting == self.dictionary:
-            return tuple(hints), None
+            return tuple(hints or [self.unseen] * (bool(images) and not found)), None
         sentence = f"No marker of {self.dictionary} is seen, but of {fitting}: set markers.dictionary: {fitting}."
         return (*hints, sentence), fitting
 
