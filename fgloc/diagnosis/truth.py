@@ -325,6 +325,8 @@ def _jumps(found: Conventions) -> None:
     moved = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
     apart = (moved, _JUMP_M / found.config.truth.scale), (turned, _JUMP_RAD)
     jumped = np.any([d > slack + 3.0 * np.percentile(d / seconds, 90) * seconds for d, slack in apart], axis=0)
+    gap = seconds > found.config.truth.max_gap_s
+    jumped &= ~(gap | np.append(False, gap[:-1]))  # what comes first after a gap may be older than its stamp of receipt
     if jumped.any():
         times = f"{jumped.sum()} time{'s' if jumped.sum() > 1 else ''}"
         text = f"The truth jumps {times}, by up to {moved[jumped].max():.3g} m and {turned[jumped].max():.3g} rad"
