@@ -224,6 +224,16 @@ def test_fault_21_a_silence_of_all_sensors_for_60_s():
     assert chain.localizer.estimator.rebuilt == 0
 
 
+def test_a_silence_that_the_odometry_s_pose_bridges_tells_no_way_within():
+    settings = config(wheels={"source": "pose"})
+    world, _, estimates = drive("beacons", settings, seconds=30.0, blind=((10, 20),), dumb=((10, 20),))
+    silent = [e for e in estimates if 11.0 < seconds(e) < 19.5]
+    assert len(silent) > 5
+    assert all(position_error(e, world.truth(e.stamp_ns)) < 3 * math.sqrt(np.trace(e.cov[:2, :2])) for e in silent)
+    back = next(e for e in estimates if seconds(e) > 20.0)
+    assert position_error(back, world.truth(back.stamp_ns)) < 0.2 > math.sqrt(np.trace(back.cov[:2, :2]))
+
+
 def test_fault_22_90_s_without_markers():
     world, _, estimates = drive("corners", seconds=110.0, blind=((10, 100),))
     assert modes(estimates)[:2] == [Mode.OK, Mode.DEAD_RECKONING]

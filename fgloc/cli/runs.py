@@ -405,10 +405,11 @@ def evaluate(
     kind: Literal["none", "se2"] = "se2" if align is Align.SE2 else "none"
     true = read_tum(truth)
     true = replace(true, has_yaw=not lacks_yaw(true.poses))
-    matched = match(read_tum(estimate), true, kind, max_gap)
+    estimated = read_tum(estimate)
+    matched = match(estimated, true, kind, max_gap)
     drift, relative, yaw = metrics.drift_percent(matched), metrics.relative_error(matched, 1.0), matched.has_yaw
     rows = [
-        ("poses matched", f"{len(matched.stamps_ns)}"),
+        ("poses matched", f"{len(matched.stamps_ns)} of {len(estimated)}"),
         ("ATE mean", f"{metrics.ate_mean_m(matched):.6f} m"),
         ("ATE rmse", f"{metrics.ate_rmse_m(matched):.6f} m"),
         ("yaw MAE", f"{metrics.yaw_mae_deg(matched):.6f} deg" if yaw else "-"),
@@ -423,6 +424,8 @@ def evaluate(
     say_table(None, rows)
     if size is not None and size.told:
         say_remark("warning", size.finding.text)
+    if remark := metrics.frame_remark(matched):
+        warn(remark)
 
 
 def compare(

@@ -136,7 +136,7 @@ class Signals:
         spatial: whether the points of ``seen`` have three measured coordinates.
         images: whether the recording has images, which are not read here.
         odometry: rows of time, x, y, yaw, and the twist's vx, vy, ω as the driver reports them, whatever their unit.
-        delays: received minus stamped [s], by role.
+        delays: received minus stamped [s], by role; infinite where a stamp is 0.
     """
 
     origin_ns: int = 0
@@ -267,7 +267,8 @@ class SignalCollector:
             self._values += len(event.sightings)
         role = self._role_of.get(event.topic)
         if role is not None:
-            self.found.delays[role].append((event.received_ns - event.stamp_ns) * 1e-9)
+            late_s = (event.received_ns - event.stamp_ns) * 1e-9 if event.stamp_ns > 0 else math.inf
+            self.found.delays[role].append(late_s)
         if isinstance(event, MotionEvent) and event.odometer is not None:
             row = ((event.stamp_ns - self.found.origin_ns) * 1e-9, *event.odometer.pose, *event.odometer.twist)
             if all(abs(value) <= _FARTHEST for value in row):  # nor with a NaN in it
@@ -337,21 +338,29 @@ _FEWEST = 5  # messages of a role
 
 
 def other_clocks(delays: Mapping[Role, float]) -> tuple[Role, ...]:
-    """Roles whose stamps are of another clock than most.
+    """Roles whose stamps are of another clock than most, or not set.
 
     Args:
-        delays: received minus stamped [s], by role; of two roles either may be wrong, and none is named.
+        delays: received minus stamped [s], by role, infinite where stamps are 0; of two roles either may be of another
+            clock, and none is named.
     """
-    usual = float(np.median(list(delays.values()))) if len(delays) > 2 else math.nan
-    return tuple(sorted(role for role, delay in delays.items() if abs(delay - usual) > _OTHER_CLOCK_S))
+    usual = _usual(delays) if len(delays) > 2 else math.nan
+    return tuple(sorted(role for role, d in delays.items() if math.isinf(d) or abs(d - usual) > _OTHER_CLOCK_S))
+
+
+def _usual(delays: Mapping[Role, float]) -> float:
+    """Median of those delays that are finite; NaN: none is."""
+    return float(np.median([d for d in delays.values() if math.isfinite(d)] or [math.nan]))
 
 
 def clock_sentence(roles: Sequence[Role], delays: Mapping[Role, float], given: Sequence[Role]) -> str:
     """Sentence on roles whose stamps are of another clock; ``given``: those that the configuration lists already."""
-    usual = float(np.median([delay for role, delay in delays.items() if role not in roles]))
+    usual = _usual({role: delay for role, delay in delays.items() if role not in roles})
     sentence = " and ".join(
-        f"those of {role} are {abs(late):.4g} s {'behind' if late > 0 else 'ahead'}"
-        for role, late in ((role, delays[role] - usual) for role in roles)
+        f"those of {role} are not set"
+        if math.isinf(late)
+        else f"those of {role} are {abs(late - usual):.4g} s {'behind' if late > usual else 'ahead'}"
+        for role, late in ((role, delays[role]) for role in roles)
     )
     line = f"recording.received_stamps: [{', '.join([*given, *roles])}]"
     return f"Some stamps are of another clock ({sentence}): set {line}."

@@ -43,6 +43,8 @@ _PRIOR_SIGMAS = 4.0  # of the wheels, by which a truth may find them off: what i
 _GAP_S = 0.25  # between two poses of the truth, over which it is interpolated
 _KNOWN_YAW = 0.01  # rad: sigma of the yaw of a tracked body that hardly turned
 _FROZEN_S, _MOVES_MPS, _FROZEN_SHARE = 0.1, 0.05, 0.02  # of a truth; fewer repetitions are a slower source's
+_FEWEST = 30  # messages of a truth
+_JUMP_M, _JUMP_RAD = 0.3, 0.5  # within one message of a truth: noise and bursts of stamps make less
 _TURNS_RAD, _WINDOWS = 0.05, 6  # rad in a second, for so many of them
 _SAME_YAW = 1e-3  # share of a turn by which a truth's yaw differs from the odometry's that it is
 _WIDE_M, _IN_PLANE, _LEVEL_DEG = 0.3, 0.5, 1.0  # of a truth's places: spread, share off their plane, tilt of it
@@ -188,10 +190,13 @@ def _body(
 
 def true_body(found: Conventions, path: Path) -> BodyFit | None:
     """Truth against the wheels; None: there is none, or it is of something else. Only evaluation reads a truth."""
-    poses = found.signals.true_poses()
-    if poses is None or path.length_m < 0.3:
+    if len(found.signals.truth) < _FEWEST or path.length_m < 0.3:
         return None
     _frozen(found, path)
+    _jumps(found)
+    poses = found.signals.true_poses()
+    if poses is None:
+        return None
     _tilted(found)
     section = found.config.truth
     own = poses.copy()
@@ -274,6 +279,10 @@ def _tilted(found: Conventions) -> None:
     figure = Figure(math.degrees(tilt), math.degrees(sigma))
     if spread < _WIDE_M or off > _IN_PLANE * spread * math.sin(tilt) or not figure.off(0.0, _LEVEL_DEG):
         return
+    if tilt > 0.25 * math.pi:
+        text = "The truth's plane stands upright: another axis than z is up, y in some motion capture: turn it"
+        found.add("truth.axes", text, None, figure, Severity.WARNING)
+        return
     text = (
         f"The truth's plane is tilted by {figure.value:.1f}° (± {figure.sigma:.1f}) against its z axis, or the floor "
         f"slopes: distances along the slope are {100.0 * (1.0 - math.cos(tilt)):.2g} % short"
@@ -282,7 +291,10 @@ def _tilted(found: Conventions) -> None:
 
 
 def _normal(places: FloatArray) -> tuple[FloatArray, float, float]:
-    """Upward normal ``(3,)`` of places ``(n, 3)``, their spread in the narrower direction and off the plane [m]."""
+    """Normal ``(3,)``, its largest part positive, of places ``(n, 3)``; their spread in its plane and off it [m].
+
+    The spread is that in the narrower direction.
+    """
     use = np.ones(len(places), dtype=bool)
     for _ in range(3):  # without glitches
         middle = np.median(places[use], axis=0)
@@ -290,7 +302,7 @@ def _normal(places: FloatArray) -> tuple[FloatArray, float, float]:
         off = np.abs((places - middle) @ axes[2])
         use = off <= 4.0 * float(np.median(off)) + 1e-9
     size = sizes / math.sqrt(float(use.sum()))
-    return axes[2] * math.copysign(1.0, axes[2, 2]), float(size[1]), float(size[2])
+    return axes[2] * math.copysign(1.0, axes[2, np.argmax(np.abs(axes[2]))]), float(size[1]), float(size[2])
 
 
 def _frozen(found: Conventions, path: Path) -> None:
@@ -303,6 +315,22 @@ def _frozen(found: Conventions, path: Path) -> None:
     if share > _FROZEN_SHARE:
         text = f"The truth is frozen in {100.0 * share:.0f} % of its messages while the robot moves: poses are repeated"
         found.add("truth.frozen", text, None, Figure(share, 0.0), Severity.NOTE)
+
+
+def _jumps(found: Conventions) -> None:
+    """Name a truth that jumps: by more, from one message to the next, than it otherwise moves or turns in that time."""
+    rows = in_order(found.signals.truth)
+    seconds = np.diff(rows[:, 0])
+    turned = 2.0 * np.arccos(np.minimum(np.abs((rows[1:, 4:8] * rows[:-1, 4:8]).sum(axis=1)), 1.0))
+    moved = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
+    apart = (moved, _JUMP_M / found.config.truth.scale), (turned, _JUMP_RAD)
+    jumped = np.any([d > slack + 3.0 * np.percentile(d / seconds, 90) * seconds for d, slack in apart], axis=0)
+    gap = seconds > found.config.truth.max_gap_s
+    jumped &= ~(gap | np.append(False, gap[:-1]))  # what comes first after a gap may be older than its stamp of receipt
+    if jumped.any():
+        times = f"{jumped.sum()} time{'s' if jumped.sum() > 1 else ''}"
+        text = f"The truth jumps {times}, by up to {moved[jumped].max():.3g} m and {turned[jumped].max():.3g} rad"
+        found.add("truth.jumps", text, None, Figure(float(jumped.mean()), 0.0), Severity.WARNING)
 
 
 def check_body(found: Conventions, fit: BodyFit) -> None:

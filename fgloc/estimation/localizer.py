@@ -367,7 +367,7 @@ class Recorder:
         clock_variance = self._clock_sigma_s**2 + self._motion.sources.clock_sigma_s(frame) ** 2
         by_clock = np.asarray(np.outer(twist, twist) * clock_variance)
         carried, around = tracking.kidnapped(self._sightings.association.contradicting, belief)
-        frame.added_cov = by_clock + tracking.doubt_cov(belief)
+        frame.added_cov = by_clock + tracking.doubt_cov(belief) + _in_silence(frame.readings)
         frame.carried_cov = carried * around  # of a mixture of two Gaussians, the second one wide
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + tracking.lost_cov(belief)
@@ -437,6 +437,14 @@ class Recorder:
             for f in frames
         }
         return [_with_cov(replace(e, mode=mode), covs.get(e.stamp_ns)) for e in estimates]
+
+
+def _in_silence(readings: MotionReadings) -> FloatArray:
+    """Covariance ``(3, 3)`` of a pose within a silence of the wheels that nothing else tells."""
+    wheels = readings.wheels
+    if wheels is None or wheels.of_end is None or readings.learned is not None or readings.beside:
+        return np.zeros((3, 3))
+    return np.diag(wheels.of_end * (1.0, 1.0, readings.gyro is None))
 
 
 def _with_cov(estimate: Estimate, cov: FloatArray | None) -> Estimate:

@@ -96,7 +96,7 @@ def match(
         offset_m: that point in the base frame, of a truth without a yaw.
 
     Raises:
-        TrajectoryError: fewer than two poses have a partner.
+        TrajectoryError: fewer than two poses have a partner, or the largest gap is negative or NaN.
     """
     indices = matchable(estimate, truth, max_gap_s)
     if len(indices) < FEWEST:
@@ -165,7 +165,13 @@ def compared(matched: Matched) -> tuple[FloatArray, FloatArray]:
 
 
 def matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntArray:
-    """Indices of the estimate's poses that have a truth at, or around, their stamp."""
+    """Indices of the estimate's poses that have a truth at, or around, their stamp.
+
+    Raises:
+        TrajectoryError: the largest gap is negative or NaN.
+    """
+    if not max_gap_s >= 0.0:
+        raise TrajectoryError(f"the largest gap of the truth is {max_gap_s} s, expected 0 or more")
     if len(estimate) == 0 or len(truth) == 0:
         return np.array([], dtype=np.int64)
     after = np.searchsorted(truth.stamps_ns, estimate.stamps_ns)
@@ -173,7 +179,7 @@ def matchable(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> IntA
     exact = truth.stamps_ns[inside] == estimate.stamps_ns
     between = (after > 0) & (after < len(truth))
     gap_ns = truth.stamps_ns[inside] - truth.stamps_ns[np.maximum(inside - 1, 0)]
-    return np.asarray(np.flatnonzero(exact | (between & (gap_ns <= round(max_gap_s * 1e9)))))
+    return np.asarray(np.flatnonzero(exact | (between & (gap_ns <= round(min(max_gap_s, 1e9) * 1e9)))))
 
 
 def _span(trajectory: Trajectory) -> str:
@@ -232,6 +238,7 @@ _SETTINGS = {  # of a sensor whose messages are dropped
     "image": "camera.file, recording.topics.image",
 }
 
+_DOUBTFUL = ("truth.axes", "truth.frozen", "truth.jumps")  # findings by which a truth judges no covariance
 _MOTION = ("odometry", "joints", "command")  # of which one is used
 
 
@@ -316,6 +323,7 @@ def _turned(config: Config, matched: Matched) -> Finding | None:
 _LOST = 0.1  # share of the poses
 _ELSEWHERE_SIGMAS = 10.0  # of its position, beyond which a run on a map is no wrong place
 _TURNED_RAD = 0.1  # yaw of a truth that is worth a word
+_FRAME_M = 0.3  # rmse above which the frame of a truth is asked about
 _AGREE = 0.25  # largest error of positions over the path's extent, and spread of the yaw over what it is off by
 
 
@@ -376,15 +384,36 @@ def size_of(matched: Matched) -> Size | None:
     return Size(scale, left[0], left[1] / scale, sigma)
 
 
+def frame_remark(matched: Matched) -> str | None:
+    """The sentence on a truth that fits once it is moved rigidly, or mirrored; None: neither brings them together."""
+    apart, size = ate_rmse_m(matched), size_of(matched)
+    mirrored = size_of(replace(matched, truth=matched.truth * (1.0, -1.0, 1.0)))
+    if size is None or mirrored is None or apart < _FRAME_M or size.told:
+        return None
+    if size.rigid_m < _AGREE * apart:
+        return f"The truth is in another frame: of {apart:.3g} m (rmse) {size.rigid_m:.3g} m are left by --align se2."
+    if mirrored.rigid_m < _AGREE * size.rigid_m:
+        return (
+            f"The truth is a mirror image: {mirrored.rigid_m:.3g} m (rmse) are left once x and y are exchanged, or one "
+            "of them (and the yaw) has the other sign, and the two are aligned."
+        )
+    return None
+
+
 def _optimistic(result: RunData, nees: float | None) -> Iterator[Finding]:
     lost = sum(mode is Mode.LOST for mode in result.modes)  # no sigma of a prior makes these right
     if nees is None or nees <= _MOST_NEES or 2 * lost > len(result.modes):
         return
+    doubtful = [finding.code for finding in result.findings if finding.code in _DOUBTFUL]
     yield Finding(
         "covariance.optimistic",
         f"NEES/3 is {nees:.1f}, expected about 1: the errors are {nees**0.5:.1f} times what the covariance says. "
-        "Something is off by more than its sigma: see the faults that the report lists, and raise "
-        f"{_prior_sigmas(result)} to what your installation really is.",
+        + (
+            f"The truth itself is in doubt ({', '.join(doubtful)}): mend it first."
+            if doubtful
+            else "Something is off by more than its sigma: see the faults that the report lists, and raise "
+            f"{_prior_sigmas(result)} to what your installation really is."
+        ),
         Severity.WARNING,
         value=nees,
     )

@@ -47,7 +47,9 @@ def atomic_file(path: Path, binary: bool = False) -> Iterator[IO[Any]]:
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_FOLLOW, 0o666)
         try:
             _lock(handle)
-            with os.fdopen(handle, "wb") if binary else os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            # names of files that are no UTF-8 become escapes
+            text: dict[str, Any] = {"encoding": "utf-8", "errors": "backslashreplace", "newline": ""}
+            with os.fdopen(handle, "wb") if binary else os.fdopen(handle, "w", **text) as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -252,7 +253,7 @@ def sha256_of(path: Path) -> str:
         return _digest(path)
     files = sorted(file for file in path.rglob("*") if file.is_file())
     listing = "".join(f"{_digest(file)}  {file.relative_to(path).as_posix()}\n" for file in files)
-    return hashlib.sha256(listing.encode()).hexdigest()
+    return hashlib.sha256(os.fsencode(listing)).hexdigest()
 
 
 def _digest(file: Path) -> str:
@@ -271,7 +272,10 @@ def _parse_tum_line(line: str, where: str) -> tuple[int, tuple[float, float, flo
     """Stamp [ns]; x, y [m] and yaw [rad]; z [m], roll and pitch [rad]."""
     words = line.split()
     if len(words) != 8:
-        raise TrajectoryError(f"{where}: {len(words)} values, expected the 8 of t x y z qx qy qz qw: {line.strip()!r}")
+        raise TrajectoryError(
+            f"{where}: {len(words)} values between blanks, expected the 8 of t x y z qx qy qz qw: {line.strip()!r}; "
+            "evo writes EuRoC's files so: evo_traj euroc FILE --save_as_tum"
+        )
     for word in words:
         try:
             finite = Decimal(word).is_finite()

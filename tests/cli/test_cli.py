@@ -224,6 +224,27 @@ def test_evaluate_prints_the_errors(tmp_path):
     assert "0.000000 m" in aligned
 
 
+def test_evaluate_tells_how_much_it_compared_and_a_truth_of_other_axes(tmp_path):
+    stamps = START_NS + 100_000_000 * np.arange(101)
+    poses = np.column_stack([3.0 * np.sin(0.1 * np.arange(101)), 0.1 * np.arange(101), np.zeros(101)])
+    write_tum(tmp_path / "estimate.tum", Trajectory(stamps, poses))
+    said = {}
+    for name, truth in (("same", poses[:51]), ("moved", poses + 5.0), ("mirrored", poses * (1.0, -1.0, 1.0))):
+        write_tum(tmp_path / f"{name}.tum", Trajectory(stamps[: len(truth)], truth))
+        code, stdout, stderr = fgloc("evaluate", tmp_path / "estimate.tum", tmp_path / f"{name}.tum")
+        assert code == 0
+        said[name] = stdout, "--align se2" in stderr, "mirror" in stderr
+    assert "51 of 101" in said["same"][0]
+    assert {name: told for name, (_, *told) in said.items()} == {
+        "same": [False, False],
+        "moved": [True, False],
+        "mirrored": [False, True],
+    }
+    for gap in ("nan", "-1"):
+        refused("evaluate", tmp_path / "estimate.tum", tmp_path / "same.tum", "--max-gap", gap)
+    assert fgloc("evaluate", tmp_path / "estimate.tum", tmp_path / "same.tum", "--max-gap", "inf")[0] == 0
+
+
 def test_evaluate_refuses_what_cannot_be_compared(bag, tmp_path):
     (tmp_path / "a.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
     (tmp_path / "b.tum").write_text("5.0 0 0 0 0 0 0 1\n6.0 0 0 0 0 0 0 1\n")

@@ -132,6 +132,12 @@ def record(folder: Path, wrong: Broken) -> Path:
             height = math.tan(math.radians(3.0)) * X[k] if wrong.truth == "tilted" else 0.0
             place = [*(wrong.truth_unit * np.array(place)).tolist(), height]
             turn = (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+            if wrong.truth == "upright":
+                place, turn = [place[1], 0.2, place[0]], (0.0, turn[2], 0.0, turn[3])
+            if wrong.truth == "jumping" and k % round(2.0 / STEP_S) == 0:
+                place, turn = [place[0] + 3.0, *place[1:]], (0.0, 0.0, turn[3], -turn[2])
+            if wrong.truth == "still":
+                place, turn = [0.0] * 3, (0.0, 0.0, 0.0, 1.0)
             messages.append((received, lambda s=stamp, p=place, q=turn, r=received: bag.truth("/truth", s, p, q, r)))
         for _, write in sorted(messages, key=lambda m: m[0]):
             write()
@@ -494,6 +500,16 @@ def test_a_truth_tells_its_tilt_and_a_yaw_that_is_not_its_own(tmp_path):
     assert found["truth.yaw_is_odometry"].severity is Severity.NOTE
     level = {f.code for f in inspect_all(record(tmp_path / "turned", Broken(turn=0.5)), None, Config()).found}
     assert not level & {"truth.tilt", "truth.yaw_is_odometry"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"), [("upright", "truth.axes"), ("jumping", "truth.jumps"), ("still", "truth.frozen")]
+)
+def test_a_truth_that_no_robot_can_have_is_named(tmp_path, kind, code):
+    found = inspect_all(record(tmp_path, Broken(truth=kind)), tmp_path / "map.yaml", Config()).found
+    assert code in {f.code for f in found}
+    sound = inspect_all(record(tmp_path / "sound", Broken()), tmp_path / "sound/map.yaml", Config()).found
+    assert not {f.code for f in sound} & {"truth.axes", "truth.jumps", "truth.frozen"}
 
 
 @pytest.mark.parametrize(("rate", "is_named"), [(0.3, True), (0.01, False)])

@@ -32,6 +32,7 @@ from fgloc.sensors.maps import load_map, write_map
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.sensor import roll_over
 from fgloc.types import Finding, Landmark, LandmarkMap, Severity
+from fgloc_datasets.bag import BagWriter
 
 SAMPLES = Path(__file__).resolve().parent.parent.parent / "datasets" / "samples"
 SAMPLE = SAMPLES / "installed_run"
@@ -352,6 +353,21 @@ def test_stamps_of_another_clock():
     said = clock_sentence(("imu",), delays, ("image",))
     assert "imu are 1000 s ahead" in said
     assert "recording.received_stamps: [image, imu]" in said
+
+
+def test_stamps_of_no_topic_are_set(tmp_path):
+    received = 1_700_000_000_000_000_000
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(60):
+            at = received + k * 50_000_000
+            bag.odometry("/odom", 0, (0.02 * k, 0.0, 0.0), (0.4, 0.0), received_ns=at)
+            bag.range_bearing(
+                "/landmarks", 0, [(1, 4.0 - 0.02 * k, 0.0), (2, math.hypot(2.0, 3.0 - 0.02 * k), 0.6)], at
+            )
+    result = run(tmp_path / "bag", None, Config(), "batch")
+    (named,) = [f for f in result.findings if f.code == "clock.received"]
+    assert named.lines == {"recording.received_stamps": "[odometry, sightings]"}
+    assert len(result.trajectory) > 10
 
 
 # --- frames ---

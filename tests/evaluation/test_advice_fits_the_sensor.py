@@ -9,7 +9,7 @@ from run_results import figure_eight
 
 from fgloc.config import config_of
 from fgloc.evaluation.metrics import all_findings
-from fgloc.types import InstallationFound, Setting
+from fgloc.types import Finding, InstallationFound, Setting, Severity
 
 
 def test_the_prior_of_a_drive_is_that_of_its_section_and_dead_reckoning_has_noise():
@@ -23,6 +23,14 @@ def test_the_prior_of_a_drive_is_that_of_its_section_and_dead_reckoning_has_nois
     assert "wheels.drive.sigmas" in said
     assert "expert.wheels.noise" in said
     assert "wheels.scale_sigma" not in said
+
+
+def test_a_doubtful_truth_is_mended_before_any_sigma():
+    doubted = replace(figure_eight(), findings=(Finding("truth.jumps", "It jumps.", Severity.WARNING),))
+    said = [f.text for f in all_findings(doubted, 9.0, {}, 50) if f.code == "covariance.optimistic"]
+    assert len(said) == 1
+    assert "truth.jumps" in said[0]
+    assert "sigma" not in said[0]
 
 
 def test_a_motion_model_that_reads_no_command_is_named():

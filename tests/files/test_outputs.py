@@ -173,6 +173,17 @@ def test_folder_that_cannot_be_made_is_named(tmp_path):
         outputs.write_text(tmp_path / "file" / "out.txt", "x")
 
 
+def test_names_that_are_no_text_are_hashed_and_written(tmp_path):
+    name = os.fsdecode(b"lauf_\xe4")  # of a disk whose names are Latin-1
+    (tmp_path / name).mkdir()
+    (tmp_path / name / name).write_bytes(b"123")
+    assert len(outputs.sha256_of(tmp_path / name)) == 64
+    outputs.write_json(tmp_path / "a.json", {"bag": name})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"bag": name}
+    outputs.write_text(tmp_path / "a.html", name)
+    assert (tmp_path / "a.html").read_text().startswith("lauf_")
+
+
 def test_hash_tells_contents_and_names_apart(tmp_path):
     bag = tmp_path / "bag"
     bag.mkdir()

@@ -53,9 +53,10 @@ class TwistTimeline:
         self._tail_by: FloatArray | None = None
         self._starts: list[int] = []
         self._pieces: list[Twist | None] = []  # None: unknown
-        self._bridged: dict[
-            int, tuple[float, float]
-        ] = {}  # by start: mean speed and turn rate where only the ends are known
+        # by start, where only the ends are known: mean speed and turn rate before
+        self._bridged: dict[int, tuple[float, float]] = {}
+        self._open = (0, 0)  # start and end of the newest of them whose ends do not tell the way between
+        self._seen_ns, self._given = 0, 0.0  # until when it was seen, and by what variance the rest of it is off
         self._known_s = self._way = self._turned = 0.0  # over all pieces: time [s], path [m], turn [rad]
         self._end = 0
         self._tail: Twist = (0.0, 0.0, 0.0)
@@ -92,6 +93,9 @@ class TwistTimeline:
         seconds = (end_ns - self._end) * 1e-9
         if bridged and self._known_s > 0.0:
             self._bridged[self._end] = self._way / self._known_s, self._turned / self._known_s
+            if twist is not None and seconds > _SILENT_TAU_S:
+                told = math.hypot(twist[0], twist[1]) * seconds < _BRIDGED_M and abs(twist[2]) * seconds < _BRIDGED_RAD
+                self._open, self._seen_ns, self._given = (0, 0) if told else (self._end, end_ns), self._end, 0.0
         elif twist is not None:
             self._known_s += seconds
             self._way += math.hypot(twist[0], twist[1]) * seconds
@@ -165,6 +169,27 @@ class TwistTimeline:
             [[p[0] + _FLOOR, p[1], p[2]], [p[1], p[3] + _FLOOR, p[4]], [p[2], p[4], p[5] + _FLOOR]], dtype=float
         )
         return np.array([x, y, wrap(yaw)]), cov, unknown
+
+    def unsure(self, start_ns: int, end_ns: int, seen: bool) -> tuple[FloatArray, FloatArray]:
+        """Variances ``(3,)`` by the unknown way through a long silence: of a step, and of the pose at its end alone.
+
+        The ends of the silence tell its whole way. A pose within is off by a random velocity that is bound to both; the
+        steps have none of it, for the whole would be lost. Only where more than motion is measured within, the way
+        since then has it, and the rest of the way as much. Steps come in order.
+        """
+        first, last = self._open
+        of_step = of_end = 0.0
+        if start_ns < last and first < end_ns:
+            at, seen_at, whole = ((ns - first) * 1e-9 for ns in (min(end_ns, last), self._seen_ns, last))
+            if end_ns < last and not seen:
+                here, rest, total = map(_silent_spread, (at - seen_at, whole - at, whole - seen_at))
+                of_end = here - (0.5 * (total + here - rest)) ** 2 / total + self._given
+            else:
+                of_step = _silent_spread(at) - _silent_spread(seen_at)
+                of_step = of_step if end_ns < last else min(of_step, self._given)
+                self._seen_ns, self._given = min(end_ns, last), self._given + of_step
+        fastest = np.array([self._fastest, self._fastest, self._fastest_turn]) ** 2
+        return of_step * fastest, of_end * fastest
 
     def sensitivity(self, start_ns: int, end_ns: int, width: int) -> FloatArray:
         """Derivatives ``(3, width)`` of the motion between two times (right perturbation) by the drive's parameters.
