@@ -14,6 +14,7 @@ from dataclasses import replace
 from fgloc.config import Config, Role
 from fgloc.diagnosis import gyro, landmarks, odometry, truth
 from fgloc.diagnosis.comparison import WHEELS, Conventions
+from fgloc.diagnosis.joints import check_joints
 from fgloc.diagnosis.landmark_fits import Mounting, fit_sightings
 from fgloc.diagnosis.pairs import LAG_SIGMAS, LATE_S, TELLS, Figure, RateFit, fit_rate, varied, weighted
 from fgloc.diagnosis.positions import check_positions
@@ -45,7 +46,9 @@ def conventions(
         if (rates := signals.rates()) is not None:
             gyro.check_gravity(found, rates[2], found.up)
         return found
-    path = check_steering(found, path)
+    path = check_joints(found, check_steering(found, path))
+    if path is None:
+        return found
     found.commanded = path.source == "command"
     odometry.check_sideways(found, path)
     path = odometry.check_angles(found, path)

@@ -563,11 +563,12 @@ def _clearest(fits: dict[str, tuple[int, float, float]]) -> CoarseFit | None:
     if least and fits[least][0] > 3 and misfits[least] < _COARSE_MISFIT and clear:
         sure = all(misfits[least] < _CLEARLY * misfits[kind] for kind in alike & misfits.keys() - {least})
         return CoarseFit(least if sure else "mirror", fits[least][2], fits[least][0])
-    usual = misfits.get("", math.inf)
-    doubted = usual > _NO_DOUBT and misfits.get(least, math.inf) < _CLEARLY * usual
-    if usual < (_COARSE_MISFIT if fits[""][0] > 3 else _COARSE_OF_THREE) and not doubted:
-        return CoarseFit("", fits[""][2], fits[""][0])
-    return None
+    if "" not in fits:
+        return None
+    (count, _, scale), usual = fits[""], misfits[""]
+    doubted = usual > _NO_DOUBT and misfits[least] < _CLEARLY * usual
+    fits_well = usual < (_COARSE_MISFIT if count > 3 else _COARSE_OF_THREE)
+    return CoarseFit("", scale, count) if fits_well and not doubted else None
 
 
 def _places_seen(path: Path, seen: Sightings, q: ComplexArray, width: float) -> Iterator[dict[int, complex]]:

@@ -49,7 +49,7 @@ _BIASED = 3.0  # times the configured bias that ranges usually are: shorter ones
 _ALIKE_OFF = 0.15  # logarithm by which way and turn may differ that are off by one cause
 _LOOKS_BACK_RAD = 2.0  # of a sensor: rather than two mistakes it is one, of wheels that count backwards
 _OPTICAL = "Positions of landmarks are in an optical frame (z ahead, x to the right): so they stay in place"
-_WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
+WORSE = 1.6  # times the misfit of the best axes from which on others are refuted
 _MIRRORED = 1.35  # likewise of a mirror image, where nothing else is compared
 _ALIKE = 1.25  # times the best misfit within which the more usual axes are taken
 _BY_FAR, _NEARLY = 5.0, 2.0  # times a misfit: of what is refuted by few landmarks, of what is as good with them
@@ -81,12 +81,12 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
             wrong = "the steering's sign is wrong" if found.steered else "left and right are exchanged"
             found.add("yaw.sign", f"Wheels and gyro turn in opposite directions: {wrong}, or the gyro's sign")
         return False
-    mirrored = Path(path.times, path.poses * [1.0, -1.0, -1.0], path.gaps)
+    mirrored = path.turned(-1.0)
     turned = Sightings(seen.times, seen.ids, seen.points @ _place(found)[:3, :3].T, seen.spatial)
     fits = [fit_sightings(one, turned).get("body") for one in (path, mirrored)]
     misfits = [math.inf if fit is None else fit.misfit for fit in fits]
     looks_back = fits[1] is not None and abs(se2.wrap(fits[1].yaw.value)) > _LOOKS_BACK_RAD
-    if misfits[1] * _WORSE < misfits[0]:
+    if misfits[1] * WORSE < misfits[0]:
         backwards = found.right_sides("reversed") if path.source == "ticks" else {}
         if backwards and looks_back:
             text = f"By gyro and landmarks the wheels {WRONG_SIDES['reversed']}"
@@ -95,7 +95,7 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
         text = "The wheels turn in the opposite direction of gyro and landmarks, which agree"
         found.add("wheels.sign", text, _other_turn(found))
         return True
-    if misfits[0] * _WORSE < misfits[1]:
+    if misfits[0] * WORSE < misfits[1]:
         text = "The gyro turns in the opposite direction of wheels and landmarks, which agree"
         found.add("imu.sign", text, {"gyro.scale": -found.config.gyro.scale})
     return False
@@ -148,7 +148,7 @@ def check_sensor(found: Conventions, path: Path, seen: Sightings, turn_sigma: fl
     sound, turned_over = fits.get("body"), fits.get("body, upside down")
     by_map = _mirrored(found, path, as_given, sound, turned_over)
     usual = best.axes == "body" or (
-        sound is not None and sound.misfit < (_WORSE if seen.spatial else _MIRRORED) * best.misfit
+        sound is not None and sound.misfit < (WORSE if seen.spatial else _MIRRORED) * best.misfit
     )
     if by_map and turned_over is not None:
         best = turned_over
@@ -217,7 +217,7 @@ def _backwards(
 ) -> tuple[Path, dict[str, Mounting]] | None:
     """Name wheels that count backwards, by the landmarks alone; path and fits without that."""
     best, sound = _fitting(fits, seen), fits.get("body")
-    usual = sound is not None and best is not None and sound.misfit < _WORSE * best.misfit
+    usual = sound is not None and best is not None and sound.misfit < WORSE * best.misfit
     if path.source != "ticks" or (usual and sound is not None and abs(sound.yaw.value) < _LOOKS_BACK_RAD):
         return None
     tried = []
@@ -231,7 +231,7 @@ def _backwards(
     if not tried:
         return None
     misfit, kind, lines, other, again = min(tried, key=lambda one: one[0])
-    if best is not None and misfit > _WORSE * best.misfit:
+    if best is not None and misfit > WORSE * best.misfit:
         return None
     found.add("wheels.reversed", f"By the landmarks the wheels {WRONG_SIDES[kind]}", lines)
     return other, again
@@ -255,7 +255,7 @@ def _wheels_off(
             continue
         m = fitted[-1]
         turns = max(_best(fits).turns.value, 1e-9)
-        better = m.misfit * _WORSE < _best(fits).misfit or abs(math.log(turns / factor)) < _OTHERWISE
+        better = m.misfit * WORSE < _best(fits).misfit or abs(math.log(turns / factor)) < _OTHERWISE
         if _unscaled(m):
             tried += [(factor, *fitted)] * better
         elif _alike(m):

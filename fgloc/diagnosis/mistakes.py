@@ -247,6 +247,9 @@ class _Search:
             return True
         if not self._compared:
             self._compared = True
+            for mistake in mistakes(signals.motion, self.config):
+                if mistake.values:  # counters that roll over are no motion to compare anything with
+                    self._correct(mistake.code, mistake.sentence, mistake.section, **mistake.values)
             found = conventions(signals, self.config, parts.T_base_sensor, parts.imu_up, parts.landmark_map)
             self._conventions += found.findings
             read = (self.config.recording, self.config.map)
@@ -255,11 +258,9 @@ class _Search:
                 return True
         placed = bool({"image", "sightings"} & recording.roles.keys()) or self.config.motion.model is not None
         for mistake in mistakes(signals.motion, self.config):
-            if mistake.values:
-                self._correct(mistake.code, mistake.sentence, mistake.section, **mistake.values)
-            else:  # without the wheels' motion landmarks alone still tell the pose
-                severity = Severity.ERROR if mistake.grave and not placed else Severity.WARNING
-                self._setup.append(Finding(mistake.code, mistake.sentence, severity))
+            # without the wheels' motion landmarks alone still tell the pose
+            severity = Severity.ERROR if mistake.grave and not placed else Severity.WARNING
+            self._setup.append(Finding(mistake.code, mistake.sentence, severity))
         if parts.landmark_map is None:
             return False
         shown = self._shown(excerpt, parts)

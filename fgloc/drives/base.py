@@ -81,6 +81,7 @@ class Drive(Section):
         None, ge=1e-3, le=1e9, description="encoder ticks a turn of the driven joints; None: rad"
     )
     rolls_over: float | None = Field(None, ge=1e-3, le=1e15, description="where their positions roll over; None: never")
+    reversed: tuple[str, ...] = Field((), description="joints of wheels that count backwards")
     sigmas: dict[str, Annotated[float, Field(ge=0, le=100)]] = Field(
         {}, description="by parameter, in its unit; 0: exact; else as in docs/drives.md"
     )
@@ -152,6 +153,8 @@ class Drive(Section):
 
     def moves(self, rates: Sequence[float], angles: Sequence[float]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Twist ``(3,)`` of the base, derivatives ``(3, p)`` by the `states`, and what is left of the rows ``(n,)``."""
+        if self.reversed:
+            rates = [-rate if name in self.reversed else rate for name, rate in zip(self.driven, rates, strict=True)]
         made = self.equations(np.asarray(rates, dtype=float), np.asarray(angles, dtype=float))
         return made.solve(tuple(self.states))
 
@@ -163,6 +166,8 @@ class Drive(Section):
         known = self.usual_sigmas()
         if unknown := [name for name in self.sigmas if name not in known]:
             raise ValueError(f"sigmas: a {self.kind} has no {unknown[0]}; it has {', '.join(known)}")
+        if unknown := [name for name in self.reversed if name not in self.driven]:
+            raise ValueError(f"reversed: no wheel is called {unknown[0]}; there are {', '.join(self.driven)}")
         A = self.equations(np.ones(len(self.driven)), np.zeros(len(self.steered))).A
         if len(A) < 3 or np.linalg.svd(A, compute_uv=False)[-1] < _LEAST_SINGULAR:
             raise ValueError(f"wheels placed like this do not determine how a {self.kind} moves: see docs/drives.md")

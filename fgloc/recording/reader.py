@@ -226,6 +226,7 @@ def select_roles(
         elif candidates:
             none = f"none (recording.topics.{role}: none)"
             none += "; list others in recording.odometries to use them too" if role == "odometry" else ""
+            none += "; put together by recording.joints (docs/drives.md)" if role == "joints" else ""
             none += "; several by a pattern: /uwb/range_*" if registry.of_several(role) else ""
             problems.append(
                 f"{len(candidates)} topics could be the {role}: {', '.join(candidates)}; choose one in the "

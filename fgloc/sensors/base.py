@@ -557,5 +557,10 @@ class EventInput:
 
 
 def with_values(config: Config, section: str, values: Mapping[str, Any]) -> Config:
-    """Return the settings with some values of one section replaced."""
-    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
+    """Return the settings with some values of one section replaced; ``drive.radius`` is one within another section."""
+    own = getattr(config, section)
+    for key in [key for key in values if "." in key]:
+        inner, _, name = key.partition(".")
+        part = values.get(inner, getattr(own, inner)).model_copy(update={name: values[key]})
+        values = {k: v for k, v in values.items() if k != key} | {inner: part}
+    return config.model_copy(update={section: own.model_copy(update=values)})

@@ -389,6 +389,11 @@ def test_mirror_images_and_a_turned_sensor_are_named_where_the_wheels_alone_tell
         assert math.cos(last - yaw) == pytest.approx(1.0, abs=1e-3)
 
 
+def test_a_map_none_of_whose_landmarks_is_seen_from_a_known_way_says_nothing():
+    signals, *others = one_at_a_time(every=150)
+    assert not [f for f in conventions(signals, *others).findings if f.code.startswith(("map.", "sightings."))]
+
+
 @pytest.mark.parametrize(
     ("factor", "scale"), [(1.0, None), (1.6, None), (100.0, "0.01"), (1.0 / FOOT, None), (10.0, "0.1")]
 )

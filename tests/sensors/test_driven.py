@@ -9,6 +9,7 @@ from event_makers import in_order_of_receipt, ns, run, stepper
 from fgloc import se2
 from fgloc.config import Config, WheelsConfig, yaml_of
 from fgloc.errors import ConfigError
+from fgloc.intake.validation import EventValidator
 from fgloc.runner import run as run_recording
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
@@ -228,3 +229,26 @@ def test_a_measured_speed_of_a_car_is_no_reset():
         for k in range(60)
     ]
     assert twist_of(wheels(drive), events) == pytest.approx([30.0, 0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize("arm", [False, True])
+def test_positions_that_stay_at_zero_while_the_wheels_turn_are_none(arm):
+    names, more = (*WHEELS, "arm") if arm else tuple(WHEELS), [0.3] if arm else []
+    gate = EventValidator(Config().gate)
+    position, rates = np.array([0.0] * 4 + more), np.array([4.0] * 4 + [0.0] * len(more))
+    events = [JointsEvent(ns(k / 50), ns(k / 50), "/j", names, position, rates, np.empty(0)) for k in range(1, 100)]
+    passed = [event for event in map(gate.check, events) if event is not None]
+    assert len(passed) == len(events)
+    assert not gate.rejections
+    assert twist_of(wheels(MECANUM), passed) == pytest.approx([0.2, 0.0, 0.0], abs=1e-9)
+
+
+def test_joints_that_come_in_several_messages_are_said_to():
+    def parts():
+        for k in range(100):
+            for of, later in ((WHEELS[:2], 0), (WHEELS[2:], 5_000_000)):
+                stamp = ns(k / 50) + later
+                yield JointsEvent(stamp, stamp, "/j", tuple(of), np.zeros(2), np.empty(0), np.empty(0))
+
+    with pytest.raises(ConfigError, match=r"recording\.joints"):
+        motion_over(wheels(MECANUM), parts())

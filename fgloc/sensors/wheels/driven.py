@@ -15,6 +15,7 @@ from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.tracks import MAX_GAP_S, MAX_SPEED, PATIENCE, Track, Twist
 from fgloc.types import FloatArray
 
+_MOST_SEEN = 1000  # names
 Moved = tuple[Twist, FloatArray]  # twist, and its derivatives (3, p) by the drive's parameters
 
 
@@ -38,6 +39,7 @@ class DriveTrack(Track):
         self._drive: Drive = config.drive
         self._per_position = 1.0 if config.in_radians else math.tau / (self._drive.ticks_per_turn or 1.0)
         self._without = 0  # messages without the wheels
+        self._seen: set[str] = set()  # joints of those
 
     def _forget(self) -> None:
         self._angles: FloatArray | None = None
@@ -55,7 +57,10 @@ class DriveTrack(Track):
         rates = _entries(event.velocity, places) if self._config.in_radians else None
         if steering is None or (angles is None and rates is None):
             self.rejections["wheels.joints_incomplete"] += 1
-            self._wait(f"their values are incomplete: {', '.join(names)} need angles or rates, steering an angle")
+            self._wait(
+                f"their values are incomplete: {', '.join(names)} need angles or rates, steering an angle. "
+                "Correct wheels.drive"
+            )
             return
         moved, steady = None, False
         if self._last_ns is not None:
@@ -120,9 +125,20 @@ class DriveTrack(Track):
         missing = [name for name in wanted if name not in names]
         if not missing:
             return [names.index(name) for name in self._drive.driven]
+        if len(self._seen) < _MOST_SEEN:
+            self._seen.update(names)
+        if {*wanted} <= self._seen:
+            self._wait(
+                f"none holds all joints of wheels.drive: {', '.join(wanted)} come in several. Publish them in one "
+                "(joint_state_publisher merges), or each part on a topic of its own, which recording.joints names"
+            )
+            return None
         near = [(name, get_close_matches(name, names, n=1)) for name in missing]
         told = ", ".join(name + (f" (did you mean '{close[0]}'?)" if close else "") for name, close in near)
-        self._wait(f"none holds all joints of wheels.drive; missing: {told}; the last holds {', '.join(names)}")
+        self._wait(
+            f"none holds all joints of wheels.drive; missing: {told}; the last holds {', '.join(names)}. "
+            "Correct wheels.drive"
+        )
         return None
 
     def _wait(self, why: str) -> None:
@@ -133,7 +149,7 @@ class DriveTrack(Track):
         """
         self._without += 1
         if self._without == PATIENCE and self._last_ns is None:
-            raise ConfigError(f"{PATIENCE} messages of joint states, and {why}. Correct wheels.drive")
+            raise ConfigError(f"{PATIENCE} messages of joint states, and {why}")
 
 
 def _entries(values: FloatArray, places: Sequence[int]) -> FloatArray | None:

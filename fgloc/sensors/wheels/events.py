@@ -140,6 +140,7 @@ def from_ackermann(m: Any, when: When) -> Event:
 
 _MAX_ANGLE = 1e15  # rad or ticks, of a joint: beyond it a double has no whole ticks
 _MOST_JOINTS = 1000  # of a message: a humanoid with hands has a hundred
+_TURNS, _IDLE = 0.5, 20  # rad/s, and so many messages: no joint turns for so long and stays at position 0
 _NO_TWIST = dict(linear=np.full(3, np.nan), angular=np.full(3, np.nan), twist_cov=np.zeros((6, 6)))
 _NO_POSE = dict(position=np.full(3, np.nan), orientation=np.full(4, np.nan), pose_cov=np.zeros((6, 6)))
 
@@ -203,6 +204,16 @@ def joints_validator(checks: FieldChecks) -> Callable[[JointsEvent], Event | str
     bounds = checks.config
     measured: set[tuple[str, str, str]] = set()  # topic, joint and array of every value that was finite
 
+    idle: dict[tuple[str, ...], FloatArray] = {}  # messages in a row whose joint turns at position 0, by their joints
+
+    def turns_at_zero(event: JointsEvent) -> Any:
+        """Joints that turn on and on at position 0: a driver's way to say that it measures rates alone."""
+        at_zero, before = event.position == 0.0, idle.get(event.names)
+        count = np.where(at_zero, (0 if before is None else before) + (np.abs(event.velocity) > _TURNS), 0)
+        if before is not None or len(idle) < _MOST_JOINTS:
+            idle[event.names] = count
+        return at_zero & (count >= _IDLE)
+
     def given(event: JointsEvent, name: str, i: int) -> bool:
         """Whether a NaN is a gap: of a joint that measures this at times, or nothing else now."""
         at_position = name == "position"
@@ -238,15 +249,20 @@ def joints_validator(checks: FieldChecks) -> Callable[[JointsEvent], Event | str
             elif name != "effort" and not any(
                 given(event, name, i) or not math.isnan(values[i]) for i in range(n) if not good[i]
             ):
-                silent = ", ".join(event.names[i] for i in range(n) if not good[i])
-                checks.note(f"{event.topic}: the {name} of {silent} is NaN; taken as not measured")
+                unknown = ", ".join(event.names[i] for i in range(n) if not good[i])
+                checks.note(f"{event.topic}: the {name} of {unknown} is NaN; taken as not measured")
             else:
                 finite = all(math.isfinite(value) for value in values)
                 checks.rejections["joints." + (wild if finite else f"{name}_non_finite")] += 1
                 changes[name] = np.where(good, array, np.nan)
         if not usable:
             return "non_finite"
-        return replace(event, **changes) if changes else event
+        checked = replace(event, **changes) if changes else event
+        if len(checked.position) != len(checked.velocity) or not (silent := turns_at_zero(checked)).any():
+            return checked
+        named = ", ".join(name for name, one in zip(event.names, silent, strict=True) if one)
+        checks.note(f"{event.topic}: the position of {named} stays 0 while it turns; taken as not measured")
+        return replace(checked, position=np.empty(0) if silent.all() else np.where(silent, np.nan, checked.position))
 
     return validate
 

@@ -445,6 +445,13 @@ WRONG_SIDES = {
 
 def right_sides(kind: str, wheels: WheelsConfig) -> dict[str, Any]:
     """Settings of joints that undo a mistake of `WRONG_SIDES`; empty: names or radii are not configured."""
+    if (drive := wheels.drive) is not None:
+        sides = {
+            "reversed": drive.driven,
+            **{f"{side}_reversed": getattr(drive, side, ()) for side in ("left", "right")},
+        }
+        names = sides.get(kind, ())
+        return {"drive.reversed": tuple(sorted({*drive.reversed} ^ {*names}))} if names else {}
     joints = {"left_joint": wheels.right_joint, "right_joint": wheels.left_joint}
     exchanged = joints if None not in joints.values() else {}
     if kind == "exchanged":
@@ -493,11 +500,13 @@ def mistakes(motion: Sequence[Event], config: Config) -> tuple[RawMistake, ...]:
     found = []
     rolled = roll_over(motion, config)
     if rolled is not None:
+        of_drive = config.wheels.drive is not None
+        unit, line = ("rad" if config.wheels.in_radians else "ticks", "drive.rolls_over" if of_drive else "angle_range")
         sentence = (
-            f"The wheel angles roll over after {rolled[0]:.4f} rad ({rolled[1]} times in what was looked at): "
-            f"set expert.wheels.angle_range: {rolled[0]:.4f}."
+            f"The wheel angles roll over after {rolled[0]:.4f} {unit} ({rolled[1]} times in what was looked at): "
+            f"set {'' if of_drive else 'expert.'}wheels.{line}: {rolled[0]:.4f}."
         )
-        found.append(RawMistake("wheels.roll_over", sentence, "wheels", {"angle_range": rolled[0]}))
+        found.append(RawMistake("wheels.roll_over", sentence, "wheels", {line: rolled[0]}))
     wheels = config.wheels
     joints = [e for e in motion if isinstance(e, JointsEvent) and e.names]
     others = any(isinstance(e, (OdometryEvent, ControlEvent)) for e in motion)
@@ -600,23 +609,23 @@ def _joint_rate(joints: Sequence[JointsEvent]) -> float:
 
 
 def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | None:
-    """Angle [rad] after which the wheels' angles roll over, and how often they did; None: they do not.
+    """Position after which the wheels' positions roll over, and how often they did; None: they do not.
 
     Args:
         motion: events in order of receipt, among them joint states.
         config: of the wheels.
     """
     joints = [e for e in motion if isinstance(e, JointsEvent) and len(e.position) == len(e.names)]
-    if config.wheels.angle_range is not None or len(joints) < 10:
+    wheels = config.wheels
+    given = wheels.angle_range if wheels.drive is None else wheels.drive.rolls_over
+    if given is not None or len(joints) < 10:
         return None
     try:
-        pair = wheel_names(joints[0].names, config.wheels.left_joint, config.wheels.right_joint)
+        pair = wheel_names(joints[0].names, wheels.left_joint, wheels.right_joint) if wheels.drive is None else None
     except ConfigError:  # ambiguous: the run reports it
         return None
-    if pair is None:
-        return None
     jumps: list[float] = []
-    for name in pair:
+    for name in pair or (() if wheels.drive is None else wheels.drive.driven):
         angles = np.array([e.position[e.names.index(name)] for e in joints if name in e.names])
         jumps += _jumps(angles[np.isfinite(angles)])
     if len(jumps) < _ROLLS:
@@ -624,8 +633,10 @@ def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | No
     size = float(np.median(jumps))
     if float(np.mean(np.abs(np.array(jumps) - size) < _SAME_JUMP * size)) < 0.9:
         return None
-    turn = 2.0 * math.pi
-    return (turn if abs(size - turn) < _WHOLE_TURN * turn else size), len(jumps)
+    whole = [math.tau]  # counters have so many bits, or begin anew with each turn
+    if wheels.drive is not None and wheels.drive.ticks_per_turn is not None:
+        whole = [wheels.drive.ticks_per_turn, 2.0 ** round(math.log2(size))]
+    return next((turn for turn in whole if abs(size - turn) < _WHOLE_TURN * turn), size), len(jumps)
 
 
 def _jumps(angles: FloatArray) -> list[float]:
