@@ -299,11 +299,10 @@ class WheelMotion:
             timeline = self._active(step)
             motion, cov, unknown_s = self._integrate(timeline, step.start_ns, step.stamp_ns)
             start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns
-            of_step, of_end = timeline.unsure(start_ns, end_ns, bool(step.sightings or step.sensed))
+            of_end = timeline.unsure(start_ns, end_ns, bool(step.sightings or step.sensed))
             if unknown_s > 0.0:
                 self._unknown_steps += 1
                 self._unknown_s += unknown_s
-            cov += np.diag(of_step)
             measured = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov, of_end=of_end)
         self._taken[step] = measured
         return measured

@@ -56,7 +56,7 @@ class TwistTimeline:
         # by start, where only the ends are known: mean speed and turn rate before
         self._bridged: dict[int, tuple[float, float]] = {}
         self._open = (0, 0)  # start and end of the newest of them whose ends do not tell the way between
-        self._seen_ns, self._given = 0, 0.0  # until when it was seen, and by what variance the rest of it is off
+        self._seen_ns = 0  # until when it was seen
         self._known_s = self._way = self._turned = 0.0  # over all pieces: time [s], path [m], turn [rad]
         self._end = 0
         self._tail: Twist = (0.0, 0.0, 0.0)
@@ -95,7 +95,7 @@ class TwistTimeline:
             self._bridged[self._end] = self._way / self._known_s, self._turned / self._known_s
             if twist is not None and seconds > _SILENT_TAU_S:
                 told = math.hypot(twist[0], twist[1]) * seconds < _BRIDGED_M and abs(twist[2]) * seconds < _BRIDGED_RAD
-                self._open, self._seen_ns, self._given = (0, 0) if told else (self._end, end_ns), self._end, 0.0
+                self._open, self._seen_ns = (0, 0) if told else (self._end, end_ns), self._end
         elif twist is not None:
             self._known_s += seconds
             self._way += math.hypot(twist[0], twist[1]) * seconds
@@ -170,26 +170,23 @@ class TwistTimeline:
         )
         return np.array([x, y, wrap(yaw)]), cov, unknown
 
-    def unsure(self, start_ns: int, end_ns: int, seen: bool) -> tuple[FloatArray, FloatArray]:
-        """Variances ``(3,)`` by the unknown way through a long silence: of a step, and of the pose at its end alone.
+    def unsure(self, start_ns: int, end_ns: int, seen: bool) -> FloatArray:
+        """Variances ``(3,)`` by the unknown way through a long silence, of the pose at a step's end alone.
 
-        The ends of the silence tell its whole way. A pose within is off by a random velocity that is bound to both; the
-        steps have none of it, for the whole would be lost. Only where more than motion is measured within, the way
-        since then has it, and the rest of the way as much. Steps come in order.
+        The ends of the silence tell its whole way. A pose within is off by a random velocity that is bound to both, or
+        to where more than motion was ``seen`` last; the steps have none of it, for the whole would be lost. Steps come
+        in order.
         """
         first, last = self._open
-        of_step = of_end = 0.0
+        of_end = 0.0
         if start_ns < last and first < end_ns:
             at, seen_at, whole = ((ns - first) * 1e-9 for ns in (min(end_ns, last), self._seen_ns, last))
-            if end_ns < last and not seen:
+            if seen:
+                self._seen_ns = min(end_ns, last)
+            elif end_ns < last:
                 here, rest, total = map(_silent_spread, (at - seen_at, whole - at, whole - seen_at))
-                of_end = here - (0.5 * (total + here - rest)) ** 2 / total + self._given
-            else:
-                of_step = _silent_spread(at) - _silent_spread(seen_at)
-                of_step = of_step if end_ns < last else min(of_step, self._given)
-                self._seen_ns, self._given = min(end_ns, last), self._given + of_step
-        fastest = np.array([self._fastest, self._fastest, self._fastest_turn]) ** 2
-        return of_step * fastest, of_end * fastest
+                of_end = here - (0.5 * (total + here - rest)) ** 2 / total
+        return of_end * np.array([self._fastest, self._fastest, self._fastest_turn]) ** 2
 
     def sensitivity(self, start_ns: int, end_ns: int, width: int) -> FloatArray:
         """Derivatives ``(3, width)`` of the motion between two times (right perturbation) by the drive's parameters.
