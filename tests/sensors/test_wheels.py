@@ -369,6 +369,20 @@ def test_the_twist_is_used_where_the_poses_heading_is_not_that_of_its_motion(dri
     assert any("5.7°" in note for note in wheels.notes)
 
 
+def test_a_heading_that_was_doubted_at_first_turns_no_motion_later(drive):
+    rng = np.random.default_rng(0)
+    off = {t: rng.normal(0.2, 0.1) if t < 3.0 else 0.0 for t in times(0.1, 18, 4)}
+    events = [odometry(t, se2.compose(drive.pose(t), (0.0, 0.0, turned)), drive.twist(t)) for t, turned in off.items()]
+    wheels, doubted = WheelMotion(WheelsConfig()), []
+    for step in run(stepper(), events):
+        m = wheels.measure(step)
+        doubted.append(wheels.by_twist)
+        if m is not None and step.start_ns > ns(13.0):
+            assert m.motion == pytest.approx(drive.motion(step.start_ns, step.stamp_ns), abs=0.005)
+    assert any(doubted)
+    assert not doubted[-1]
+
+
 def test_a_pose_whose_heading_is_off_bridges_a_silence_of_the_whole_robot(drive):
     turned = (0.0, 0.0, 0.1)
     rate = times(0.1, 20, 20)

@@ -567,7 +567,7 @@ class OdometryTrack(Track):
         self._compared = pose_still or sure or pose_path > _CHECK_PATH
         insists = self._config.source == "twist"
         ratio = twist_turn / max(pose_turn, 1e-9)
-        mode = "pose"
+        mode, self._askew = "pose", 0.0
         if pose_still:
             mode, text = "twist", "the odometry's pose does not move: its twist is used"
         elif twist_still:
