@@ -56,6 +56,7 @@ _BY_FAR, _NEARLY = 5.0, 2.0  # times a misfit: of what is refuted by few landmar
 _FITS = 0.3  # misfit over the median distance of landmarks above which nothing fits
 _NO_DRIFT = math.log(7.0)  # of a scale: less may be wheels that drift, and no map in feet is named so
 _COARSELY = math.log(1.3)  # by which a scale by wheels alone may miss a unit
+_ORIENTED = {"sightings.axes", "sightings.mounting", "sightings.mirrored", "wheels.sign", "wheels.reversed", "imu.sign"}
 _MIRROR_IMAGE = "The map is a mirror image of what is seen: change the sign of all its y"
 _SCALED = {"map.unit", "map.contradiction", "map.mirrored", "map.ids", "sightings.scale", "wheels.scale", "scales"}
 _FIRST_S = 8.0  # of sightings that tell where a run began: wheels err by centimetres over it
@@ -503,11 +504,13 @@ def check_map(found: Conventions, path: Path, seen: Sightings | None) -> None:
     if fitted is None:
         return
     scale, count, kind = fitted.scale, fitted.count, fitted.kind
+    if kind and found.codes & _ORIENTED:
+        return
     if kind == "map":
         found.add("map.mirrored", _MIRROR_IMAGE)
     elif kind == "mirror":
         text = f"Map or bearings are a mirror image, by {count} landmarks: change the sign of all its y, or of bearings"
-        found.add("map.mirrored", text)
+        found.add("sightings.mirrored", text)
     elif kind == "turn":
         text = f"The wheels turn the other way than map and sightings, which agree, by {count} landmarks"
         found.add("wheels.sign", text, _other_turn(found))
