@@ -80,12 +80,8 @@ def _changed(recording: Recording, name: str, seed: int, _: Path, out: Path) -> 
 # --- which messages are there, and when -----------------------------------------------------------------------------
 
 
-def _span(messages: Messages) -> tuple[int, int]:
-    return messages[0].received, messages[-1].received
-
-
 def _moment(messages: Messages, rng: random.Random) -> int:
-    begin, end = _span(messages)
+    begin, end = messages[0].received, messages[-1].received
     return begin + round(rng.uniform(0.4, 0.7) * (end - begin))
 
 
@@ -260,20 +256,16 @@ def _restarted(messages: Messages, rng: random.Random) -> Messages:
 
 
 def _pose_alone(messages: Messages, _: random.Random) -> Messages:
-    return _edited_twist(messages, lambda t: _set_twist(t, 0, lambda _, v: 0.0 * v))
+    for m in messages:
+        if m.kind == "Odometry":
+            _set_twist(m.message.twist.twist, 0, lambda _, twist: 0.0 * twist)
+    return messages
 
 
 def _twist_alone(messages: Messages, _: random.Random) -> Messages:
     for m in messages:
         if m.kind == "Odometry":
             _set(m.message.pose.pose, np.zeros(3))
-    return messages
-
-
-def _edited_twist(messages: Messages, edit: Callable[[Any], None]) -> Messages:
-    for m in messages:
-        if m.kind == "Odometry":
-            edit(m.message.twist.twist)
     return messages
 
 

@@ -373,7 +373,7 @@ class MotionMeasurement:
     # by parameter of the installation: derivative (3,) of the motion (right perturbation), and the value it has in it
     depends_on: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
     inertial: InertialReading | None = None  # of the same step; on uneven ground
-    of_end: FloatArray | None = None  # (3,) variances of the pose at the end alone, which no later step goes on from
+    end_variance: FloatArray | None = None  # (3,) of the pose at the end alone: no later step goes on from it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

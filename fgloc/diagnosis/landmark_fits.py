@@ -528,23 +528,21 @@ def coarse_fit(
     """
     p, r = complex_poses(path, seen.times)
     z = planar(seen.points, "body")
-    readings = {"": z, "map": z, "turn": z.conj(), **{kind: turn * z for kind, turn in LOOKS.items()}}
-    if not seen.spatial:
-        readings["bearings"] = z.conj()
+    over = {"turn": True} if seen.spatial else {"turn": True, "bearings": False}
+    readings = [(z, {"": False, "map": True}), (z.conj(), over)]  # with kinds, and whether the map is mirrored in them
+    readings += [(turn * z, {kind: False}) for kind, turn in LOOKS.items()]
     for width in _COARSE_S:
         fits: dict[str, tuple[int, float, float]] = {}  # landmarks, misfit with a minus, scale
-        for kind, reading in readings.items():
-            windows = [
-                (sum(i in places for i in window), window)
-                for window in _places_seen(path, seen, p + r * (reading + complex(*place)), width)
-            ]
-            laid = [
-                (count, -misfit, scale)
-                for count, window in windows
-                for scale, misfit in zip(*_laid_on([window], places, 0, kind in ("map", "turn")), strict=True)
-            ]
-            if laid:
-                fits[kind] = max(laid)
+        for reading, kinds in readings:
+            windows = list(_places_seen(path, seen, p + r * (reading + complex(*place)), width))
+            for kind, mirrored in kinds.items():
+                laid = [
+                    (sum(i in places for i in window), -misfit, scale)
+                    for window in windows
+                    for scale, misfit in zip(*_laid_on([window], places, 0, mirrored), strict=True)
+                ]
+                if laid:
+                    fits[kind] = max(laid)
         found = _clearest(fits)
         if found is not None:
             return found

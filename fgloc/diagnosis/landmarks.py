@@ -16,6 +16,7 @@ from fgloc.diagnosis.comparison import GEAR, WHEELS, Conventions, unit_of
 from fgloc.diagnosis.landmark_fits import (
     AXES,
     LOOKS,
+    CoarseFit,
     Mounting,
     coarse_fit,
     compared,
@@ -94,7 +95,7 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
             found.add("wheels.reversed", text, backwards)
             return True
         text = "The wheels turn in the opposite direction of gyro and landmarks, which agree"
-        found.add("wheels.sign", text, _other_turn(found))
+        found.add("wheels.sign", text, _lines_of_turn(found))
         return True
     if misfits[0] * WORSE < misfits[1]:
         text = "The gyro turns in the opposite direction of wheels and landmarks, which agree"
@@ -102,7 +103,7 @@ def which_is_opposite(found: Conventions, path: Path, seen: Sightings | None) ->
     return False
 
 
-def _other_turn(found: Conventions) -> dict[str, Any]:
+def _lines_of_turn(found: Conventions) -> dict[str, Any]:
     """Lines for wheels that turn the wrong way."""
     wheels = found.config.wheels
     if (drive := found.steered) is not None:
@@ -503,32 +504,11 @@ def check_map(found: Conventions, path: Path, seen: Sightings | None) -> None:
     fitted = coarse_fit(path, as_given, (float(T[0, 3]), float(T[1, 3])), found.places)
     if fitted is None:
         return
-    scale, count, kind = fitted.scale, fitted.count, fitted.kind
-    if kind and found.codes & _ORIENTED:
+    if fitted.kind:
+        if not found.codes & _ORIENTED:
+            _other_than_configured(found, fitted)
         return
-    if kind == "map":
-        found.add("map.mirrored", _MIRROR_IMAGE)
-    elif kind == "mirror":
-        text = f"Map or bearings are a mirror image, by {count} landmarks: change the sign of all its y, or of bearings"
-        found.add("sightings.mirrored", text)
-    elif kind == "turn":
-        text = f"The wheels turn the other way than map and sightings, which agree, by {count} landmarks"
-        found.add("wheels.sign", text, _other_turn(found))
-    elif kind:
-        turn = LOOKS.get(kind)
-        R = rotation_to_base("body, upside down") if turn is None else rpy_matrix(0.0, 0.0, cmath.phase(turn))
-        moved = homogeneous(R @ T[:3, :3])
-        moved[:3, 3] = T[:3, 3]
-        pose = sensor_pose(moved, found.config.recording.sightings_axes == "optical")
-        text = f"The landmarks stand as on the map, by {count} of them, if "
-        if turn is None:
-            text += "bearings count to the right (or the sensor is upside down)"
-        else:
-            text += f"the sensor looks {math.degrees(cmath.phase(turn)):+.0f}° further left than configured"
-        line = {"recording.sightings_pose": [round(v, 4) + 0.0 for v in pose]}
-        found.add("sightings.mirrored" if turn is None else "sightings.mounting", text, line)
-    if kind:
-        return
+    scale, count = fitted.scale, fitted.count
     unit = unit_of(1.0 / scale, _COARSELY, speeds=False)
     if unit is None and abs(math.log(scale / 10.0)) < _COARSELY:
         unit = 0.1, "decimetres"
@@ -540,6 +520,34 @@ def check_map(found: Conventions, path: Path, seen: Sightings | None) -> None:
     )
     factor = round(found.config.map.scale * unit[0], 6)
     found.add("map.unit", text, {"map.scale": factor}, Figure(1.0 / scale, _COARSELY / scale))
+
+
+def _other_than_configured(found: Conventions, fitted: CoarseFit) -> None:
+    """Name the mirror image, or the turn of wheels or sensor, with which the landmarks stand as on the map."""
+    count, kind, T = fitted.count, fitted.kind, _place(found)
+    if kind == "map":
+        found.add("map.mirrored", _MIRROR_IMAGE)
+        return
+    if kind == "mirror":
+        text = f"Map or bearings are a mirror image, by {count} landmarks: change the sign of all its y, or of bearings"
+        found.add("sightings.mirrored", text)
+        return
+    if kind == "turn":
+        text = f"The wheels turn the other way than map and sightings, which agree, by {count} landmarks"
+        found.add("wheels.sign", text, _lines_of_turn(found))
+        return
+    if kind == "bearings":
+        code, R, what = "sightings.mirrored", rotation_to_base("body, upside down"), "bearings count to the right"
+    else:
+        yaw = cmath.phase(LOOKS[kind])
+        side = "left" if yaw > 0.0 else "right"
+        code, R = "sightings.mounting", rpy_matrix(0.0, 0.0, yaw)
+        what = f"the sensor looks {math.degrees(abs(yaw)):.0f}° further to the {side} than configured"
+    moved = homogeneous(R @ T[:3, :3])
+    moved[:3, 3] = T[:3, 3]
+    pose = sensor_pose(moved, found.config.recording.sightings_axes == "optical")
+    text = f"The landmarks stand as on the map, by {count} of them, if {what}"
+    found.add(code, text, {"recording.sightings_pose": [round(v, 4) + 0.0 for v in pose]})
 
 
 def _three(found: Conventions, path: Path, by_wheels: Figure, on_map: Figure, ranges: Figure) -> None:

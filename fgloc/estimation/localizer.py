@@ -439,12 +439,12 @@ class Recorder:
         return [_with_cov(replace(e, mode=mode), covs.get(e.stamp_ns)) for e in estimates]
 
 
-def _in_silence(readings: MotionReadings) -> FloatArray:
-    """Covariance ``(3, 3)`` of a pose within a silence of the wheels that nothing else tells."""
+def _in_silence(readings: MotionReadings) -> FloatArray | float:
+    """Covariance ``(3, 3)`` of a pose within a silence of the wheels that nothing else tells; 0: it is in none."""
     wheels = readings.wheels
-    if wheels is None or wheels.of_end is None or readings.learned is not None or readings.beside:
-        return np.zeros((3, 3))
-    return np.diag(wheels.of_end * (1.0, 1.0, readings.gyro is None))
+    if wheels is None or wheels.end_variance is None or readings.learned is not None or readings.beside:
+        return 0.0
+    return np.diag(wheels.end_variance * (1.0, 1.0, readings.gyro is None))
 
 
 def _with_cov(estimate: Estimate, cov: FloatArray | None) -> Estimate:

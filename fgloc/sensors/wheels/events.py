@@ -208,7 +208,12 @@ def joints_validator(checks: FieldChecks) -> Callable[[JointsEvent], Event | str
 
     def turns_at_zero(event: JointsEvent) -> Any:
         """Joints that turn on and on at position 0: a driver's way to say that it measures rates alone."""
-        at_zero, before = event.position == 0.0, idle.get(event.names)
+        at_zero = event.position == 0.0
+        before = idle.get(event.names)
+        if not at_zero.any():
+            if before is not None:
+                del idle[event.names]
+            return at_zero
         count = np.where(at_zero, (0 if before is None else before) + (np.abs(event.velocity) > _TURNS), 0)
         if before is not None or len(idle) < _MOST_JOINTS:
             idle[event.names] = count

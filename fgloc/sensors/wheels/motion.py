@@ -201,7 +201,7 @@ class WheelMotion:
     is made of the configured noise densities alone: robots' own are rarely right. It does not depend on how time is cut
     into steps. Where no message came for longer than ``hold_s`` the robot is taken to stand still with the spread of
     its largest speed so far, so that every step has a measurement; such steps are counted as "wheels.silence". Of a way
-    that only the ends of a silence tell see `TwistTimeline.unsure`.
+    that only the ends of a silence tell see `TwistTimeline.variance_within`.
 
     Sources: with "auto" wheel angles if the geometry is given, else the odometry (see `OdometryTrack`), else commands:
     the best that has messages.
@@ -299,11 +299,11 @@ class WheelMotion:
             timeline = self._active(step)
             motion, cov, unknown_s = self._integrate(timeline, step.start_ns, step.stamp_ns)
             start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns
-            of_end = timeline.unsure(start_ns, end_ns, bool(step.sightings or step.sensed))
+            within = timeline.variance_within(start_ns, end_ns, bool(step.sightings or step.sensed))
             if unknown_s > 0.0:
                 self._unknown_steps += 1
                 self._unknown_s += unknown_s
-            measured = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov, of_end=of_end)
+            measured = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov, end_variance=within)
         self._taken[step] = measured
         return measured
 

@@ -55,7 +55,7 @@ class TwistTimeline:
         self._pieces: list[Twist | None] = []  # None: unknown
         # by start, where only the ends are known: mean speed and turn rate before
         self._bridged: dict[int, tuple[float, float]] = {}
-        self._open = (0, 0)  # start and end of the newest of them whose ends do not tell the way between
+        self._silence = (0, 0)  # start and end of the newest of them whose ends do not tell the way between
         self._seen_ns = 0  # until when it was seen
         self._known_s = self._way = self._turned = 0.0  # over all pieces: time [s], path [m], turn [rad]
         self._end = 0
@@ -95,7 +95,7 @@ class TwistTimeline:
             self._bridged[self._end] = self._way / self._known_s, self._turned / self._known_s
             if twist is not None and seconds > _SILENT_TAU_S:
                 told = math.hypot(twist[0], twist[1]) * seconds < _BRIDGED_M and abs(twist[2]) * seconds < _BRIDGED_RAD
-                self._open, self._seen_ns = (0, 0) if told else (self._end, end_ns), self._end
+                self._silence, self._seen_ns = (0, 0) if told else (self._end, end_ns), self._end
         elif twist is not None:
             self._known_s += seconds
             self._way += math.hypot(twist[0], twist[1]) * seconds
@@ -170,23 +170,24 @@ class TwistTimeline:
         )
         return np.array([x, y, wrap(yaw)]), cov, unknown
 
-    def unsure(self, start_ns: int, end_ns: int, seen: bool) -> FloatArray:
-        """Variances ``(3,)`` by the unknown way through a long silence, of the pose at a step's end alone.
+    def variance_within(self, start_ns: int, end_ns: int, seen: bool) -> FloatArray | None:
+        """Variances ``(3,)`` of the pose at a step's end by the unknown way through a silence; None: in no silence.
 
         The ends of the silence tell its whole way. A pose within is off by a random velocity that is bound to both, or
         to where more than motion was ``seen`` last; the steps have none of it, for the whole would be lost. Steps come
         in order.
         """
-        first, last = self._open
-        of_end = 0.0
-        if start_ns < last and first < end_ns:
-            at, seen_at, whole = ((ns - first) * 1e-9 for ns in (min(end_ns, last), self._seen_ns, last))
-            if seen:
-                self._seen_ns = min(end_ns, last)
-            elif end_ns < last:
-                here, rest, total = map(_silent_spread, (at - seen_at, whole - at, whole - seen_at))
-                of_end = here - (0.5 * (total + here - rest)) ** 2 / total
-        return of_end * np.array([self._fastest, self._fastest, self._fastest_turn]) ** 2
+        first, last = self._silence
+        if start_ns >= last or first >= end_ns:
+            return None
+        if seen:
+            self._seen_ns = min(end_ns, last)
+        if seen or end_ns >= last:
+            return None
+        at, seen_at, whole = ((ns - first) * 1e-9 for ns in (end_ns, self._seen_ns, last))
+        here, rest, total = map(_silent_spread, (at - seen_at, whole - at, whole - seen_at))
+        spread = here - (0.5 * (total + here - rest)) ** 2 / total
+        return spread * np.array([self._fastest, self._fastest, self._fastest_turn]) ** 2
 
     def sensitivity(self, start_ns: int, end_ns: int, width: int) -> FloatArray:
         """Derivatives ``(3, width)`` of the motion between two times (right perturbation) by the drive's parameters.
@@ -458,7 +459,9 @@ class OdometryTrack(Track):
         self._paths = [0.0, 0.0, 0.0, 0.0]  # pose: m, rad; twist: m, rad
         self._along = 0j  # sum of the pose's motions times the conjugate of the twist's [m²]
         self._across = np.zeros(3)  # sums over these products of |.|², |.|² angle, |.|² angle² [m⁴]
-        self._askew = 0.0  # angle from the way to the way by the pose's heading, where the twist is used for it [rad]
+        self._heading_off = (
+            0.0  # angle from the way to the way by the pose's heading, where the twist is used for it [rad]
+        )
 
     @property
     def by_twist(self) -> bool:
@@ -492,8 +495,8 @@ class OdometryTrack(Track):
         moved = self._between_poses(pose, mean, seconds)
         if both and mean is not None and moved is not None and not self._compared:
             self._compare(moved, mean, seconds)
-        if moved is not None and self._askew:
-            c, s = math.cos(self._askew), math.sin(self._askew)
+        if moved is not None and self._heading_off:
+            c, s = math.cos(self._heading_off), math.sin(self._heading_off)
             moved = c * moved[0] + s * moved[1], c * moved[1] - s * moved[0], moved[2]
         if moved is None or mean is None:
             return moved or mean
@@ -567,7 +570,7 @@ class OdometryTrack(Track):
         self._compared = pose_still or sure or pose_path > _CHECK_PATH
         insists = self._config.source == "twist"
         ratio = twist_turn / max(pose_turn, 1e-9)
-        mode, self._askew = "pose", 0.0
+        mode, self._heading_off = "pose", 0.0
         if pose_still:
             mode, text = "twist", "the odometry's pose does not move: its twist is used"
         elif twist_still:
@@ -579,7 +582,7 @@ class OdometryTrack(Track):
                 raise ConfigError(f"{text}; set wheels.source to pose, or wheels.scale_omega to {math.pi / 180:.6f}")
             text += ": pose differences are used"
         elif abs(heading) > _HEADING_RAD + spread:
-            mode, self._askew = "twist", heading
+            mode, self._heading_off = "twist", heading
             text = (
                 f"the odometry's twist is used: the heading of its pose is {math.degrees(-heading):+.1f}° off the "
                 "direction in which the pose moves"
