@@ -344,6 +344,12 @@ def test_fault_25_an_encoder_that_restarts_does_not_roll_over():
     assert roll_over(joints(np.mod(angles, 6.0)), Config.model_validate({"wheels": {"angle_range": 6.0}})) is None
 
 
+def test_a_silence_of_the_joints_is_no_roll_over():
+    angles = np.cumsum(np.full(1100, 0.2))
+    heard = joints(angles)
+    assert roll_over(heard[:300] + heard[800:], Config()) is None
+
+
 def test_stamps_of_another_clock():
     delays = {"joints": 0.003, "odometry": 0.002, "imu": 0.001, "image": 0.04}
     assert other_clocks(delays) == ()

@@ -626,8 +626,8 @@ def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | No
         return None
     jumps: list[float] = []
     for name in pair or (() if wheels.drive is None else wheels.drive.driven):
-        angles = np.array([e.position[e.names.index(name)] for e in joints if name in e.names])
-        jumps += _jumps(angles[np.isfinite(angles)])
+        read = np.array([(e.stamp_ns * 1e-9, e.position[e.names.index(name)]) for e in joints if name in e.names])
+        jumps += _jumps(*read[np.isfinite(read[:, 1])].T) if len(read) else []
     if len(jumps) < _ROLLS:
         return None
     size = float(np.median(jumps))
@@ -639,14 +639,14 @@ def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | No
     return next((turn for turn in whole if abs(size - turn) < _WHOLE_TURN * turn), size), len(jumps)
 
 
-def _jumps(angles: FloatArray) -> list[float]:
-    """Difference [rad] of each jump from the steps beside it."""
-    steps = np.diff(angles)
+def _jumps(times: FloatArray, angles: FloatArray) -> list[float]:
+    """Difference [rad] of each jump from the steps beside it; none is told by a step over a silence."""
+    steps, passed = np.diff(angles), np.diff(times)
     if len(steps) < 3:
         return []
     usual = max(_JUMP * float(np.median(np.abs(steps))), _LEAST_JUMP_RAD)
     found = []
-    for k in np.flatnonzero(np.abs(steps) > usual).tolist():
+    for k in np.flatnonzero((np.abs(steps) > usual) & (passed < _JUMP * np.median(passed))).tolist():
         beside = [steps[i] for i in (k - 1, k + 1) if 0 <= i < len(steps) and abs(steps[i]) <= usual]
         if beside:
             found.append(abs(float(steps[k] - np.mean(beside))))
