@@ -431,11 +431,16 @@ def _say(recording: Recording, o: Outcome) -> None:
 _HEAD = """# Recordings by others
 
 `python -m benchmarks.field --page docs/field.md` of {day}: `fgloc init BAG`, then `info`, `smooth` and `online` with the `robot.yaml` that it wrote and the
-set's map; nothing was fitted for a set. On the same messages: odometry alone, aligned to the truth, and an iSAM2 with fixed constants
-("textbook", smoothed), which on a map begins at the truth's first pose ("alike": at fgloc's). A tuned iSAM2 is in the [public bench](public.md).
+set's map. No setting was fitted for a set; choices were made with recordings marked *dev*. ATE is the rmse of positions [m]; an unknown frame of the truth or place of the tracked body is fitted for each estimator.
 
-ATE is the rmse of positions [m]; an unknown frame of the truth or place of the tracked body is fitted for each estimator. NEES/3: batch / online.
-Choices were made with recordings marked *dev*. Losses of batch against the best other first.
+| column | estimator |
+|---|---|
+| odometry | alone, aligned to the truth |
+| textbook | iSAM2 with fixed constants, smoothed; on a map from the truth's first pose (tuned: [public bench](public.md)) |
+| alike | the same from fgloc's first pose |
+| batch, online | fgloc; NEES/3 of both |
+
+Losses of batch against the best other first:
 
 | recording | odometry | textbook | alike | batch | online | NEES/3 |
 |---|---|---|---|---|---|---|
@@ -443,7 +448,7 @@ Choices were made with recordings marked *dev*. Losses of batch against the best
 
 
 def write_page(path: Path, chosen: Sequence[Recording], outcomes: Mapping[str, Outcome]) -> None:
-    """Write as Markdown: errors, losses first; what is peculiar, and which of it no finding says; why runs failed."""
+    """Write as Markdown: errors, losses first; which peculiarities no finding names; why runs failed."""
     lines = [_HEAD.format(day=datetime.now(UTC).date().isoformat()).rstrip("\n")]
     judged = [r for r in chosen if outcomes[r.name].ate]
     lines += [_line(r, outcomes[r.name]) for r in sorted(judged, key=lambda r: _order(outcomes[r.name]))]
@@ -458,15 +463,12 @@ def write_page(path: Path, chosen: Sequence[Recording], outcomes: Mapping[str, O
     traps = [trap for trap in SHEET if trap.recording in outcomes]
     missed = [f"{t.what} ({t.recording})" for t in traps if not found(t, outcomes[t.recording])]
     lines += [
-        f"Of {len(traps)} peculiarities, measured by hand (`benchmarks/field_sheet.py`), `init`, `info` or a finding of a run says "
+        f"Of {len(traps)} peculiarities, measured by hand (`benchmarks/field_sheet.py`), `init`, `info` or a run names "
         f"{len(traps) - len(missed)} with their figure. Not: {', '.join(missed) or 'none'}.",
         "",
-        "| recording | what is peculiar |",
-        "|---|---|",
+        "Exit codes other than 0 (`smooth` / `online`):",
+        "",
     ]
-    for peculiar in dict.fromkeys(r.peculiar for r in chosen):
-        lines.append(f"| {', '.join(r.name for r in chosen if r.peculiar == peculiar)} | {peculiar} |")
-    lines += ["", "Runs that ended with another exit code than 0 (`smooth` / `online`), and what they named first:", ""]
     lines += ["| recording | exit | named first |", "|---|---|---|"]
     failed = [r for r in chosen if any(outcomes[r.name].codes.get(mode) for mode in MODES)]
     lines += [

@@ -13,7 +13,7 @@ from typer.cli import get_docs_for_click
 from typer.main import get_command
 
 DOCS = Path(__file__).resolve().parent
-FOR_CONTRIBUTORS = (DOCS / "decisions", DOCS / "faults.md")  # not on the site
+FOR_CONTRIBUTORS = (DOCS / "decisions", DOCS / "architecture.md")  # not on the site
 
 
 def command_line() -> str:

@@ -79,20 +79,20 @@ class WheelsConfig(Section):
     left_joint: str | None = Field(None, description="joint of the wheel")
     right_joint: str | None = Field(None, description="joint of the wheel")
     left_radius: float | None = Field(
-        None, ge=-2.0, le=2.0, description="way per unit of the angle, usually rad; negative: it counts backwards"
+        None, ge=-2.0, le=2.0, description="distance per unit of the angle, usually rad; negative: counts backwards"
     )
     right_radius: float | None = Field(
-        None, ge=-2.0, le=2.0, description="way per unit of the angle, usually rad; negative: it counts backwards"
+        None, ge=-2.0, le=2.0, description="distance per unit of the angle, usually rad; negative: counts backwards"
     )
-    track: float | None = Field(None, ge=1e-3, le=5.0, description="between the contact points")
+    track: float | None = Field(None, ge=1e-3, le=5.0, description="distance of the contact points")
     angle_range: float | None = expert(None, ge=1e-3, le=1e9, description="where the angle rolls over")
     drive: AnyDrive | None = Field(None, description="another drive (docs/drives.md)")
     scale_v: float = Field(1.0, ge=_LEAST_SCALE, le=1e3, description="true over reported forward speed")
     scale_omega: float = Field(1.0, ge=-1e3, le=1e3, description="true over reported yaw rate; negative: clockwise")
     yaw_per_m: float = expert(0.0, ge=-1, le=1, description="yaw gained on the straight, by unequal wheels")
     slowdown: float = expert(0.0, ge=0, le=5.0, description="share of the speed lost per rad/s of turning")
-    delay_s: float = expert(0.0, ge=0, le=2.0, description="the robot moves so long after the message")
-    hold_s: float = expert(0.5, gt=0, le=60, description="a twist is held so long without a next one")
+    delay_s: float = expert(0.0, ge=0, le=2.0, description="delay from message to motion")
+    hold_s: float = expert(0.5, gt=0, le=60, description="longest time that a twist is held")
     zero_speed: float = expert(0.0, ge=0, le=10, description="a lower speed is rest")
     zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="a lower rate is rest")
     noise: NoiseDensity = NoiseDensity()
@@ -100,10 +100,10 @@ class WheelsConfig(Section):
         0.01,
         ge=0,
         le=0.5,
-        description="sigma of a scale that both radii share",
+        description="sigma of both radii together",
     )
     turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="sigma of the track")
-    time_offset_sigma_s: float = expert(0.005, ge=0, le=1.0, description="sigma of their clock")
+    time_offset_sigma_s: float = expert(0.005, ge=0, le=1.0, description="sigma of the clock")
     yaw_per_m_sigma: float = expert(
         0.015,
         ge=0,
@@ -192,7 +192,7 @@ class CameraConfig(Section):
         "jitter of a driver that stamps on arrival",
         ge=0,
         le=0.1,
-        description="what each stamp is off by on its own",
+        description="sigma of each stamp",
     )
 
 
@@ -248,7 +248,7 @@ class LandmarksConfig(Section):
         0.0,
         ge=0,
         le=1e6,
-        description="errors of one landmark last so long; not of corners",
+        description="correlation time of a landmark's errors; not of corners",
     )
 
 
@@ -262,7 +262,7 @@ class MarkersConfig(Section):
         2e-4,
         ge=0,
         le=0.1,
-        description="a corner is off by the image's motion in this time",
+        description="a corner's error is the image's motion in this time",
     )
     sway_rad: float = constant(
         0.005,
@@ -323,7 +323,7 @@ class MotionConfig(Section):
     scale: float = expert(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
     scale_sigma: float = expert(0.01, ge=0, le=0.5, description="sigma of scale")
     turn_scale: float = expert(1.0, ge=0.01, le=100, description="this robot's turn over the model's")
-    yaw_per_m: float = expert(0.0, ge=-10, le=10, description="rad/m that it is drawn to the left more than the model")
+    yaw_per_m: float = expert(0.0, ge=-10, le=10, description="pull to the left beyond the model's [rad/m]")
     adaptation_sigma: float = expert(
         0.03, ge=0, le=0.5, description="sigma of those two (share, rad/m); 0: scale alone is estimated"
     )
@@ -533,7 +533,7 @@ class RecordingConfig(Section):
 
     topics: TopicsConfig = TopicsConfig()
     joints: dict[str, JointField] = Field(
-        {}, max_length=100, description="joints that come in messages of another type than JointState (docs/drives.md)"
+        {}, max_length=100, description="joints in messages of other types (docs/drives.md)"
     )
     odometries: tuple[OdometryTopic, ...] = Field(
         (),
@@ -656,7 +656,7 @@ class KeyframesConfig(Section):
 
     max_interval_s: float = expert(0.2, ge=0.001, le=60, description="between two poses, at most")
     min_interval_s: float = constant(0.05, "bounds the poses per second", ge=0, le=60)
-    reorder_s: float = expert(0.1, ge=0, le=60, description="messages wait so long to be put in order")
+    reorder_s: float = expert(0.1, ge=0, le=60, description="time in which late messages are put in order")
     history_s: float = constant(
         2.0,
         "the shipped models read 0.8 s",
@@ -762,7 +762,7 @@ class LiveConfig(Section):
     """A live run."""
 
     startup_s: float = expert(
-        2.0, ge=0, le=1e6, description="so long after the first event the run begins with what has come"
+        2.0, ge=0, le=1e6, description="from the first event to the start with the sensors present"
     )
     image_queue: int = constant(
         4, "older images are late", gt=0, le=100_000, description="images that may wait for detection; the oldest goes"

@@ -20,6 +20,7 @@ PAGES = {"configuration.md": robot_file(), "identification.md": TrainConfig}
 _OWN_TABLE = (CameraConfig,)
 _EXPERT = "expert."
 _OF_KINDS = "`kind` names the drive, the other keys describe it."
+_OF_EXPERTS = "## Values that few users change\n"
 
 
 def sections(model=PAGES["configuration.md"], path=""):
@@ -36,7 +37,7 @@ def sections(model=PAGES["configuration.md"], path=""):
             yield f"{path}{name}", kinds
 
 
-def rows(section, prefix=""):
+def rows(section):
     """One line of a Markdown table per value of a section, or of one of several kinds.
 
     Neighbouring keys with the same default and meaning share a line. Keys of a parent class that has a table of its own
@@ -53,7 +54,7 @@ def rows(section, prefix=""):
         if _section(field) is None and name not in elsewhere
     ]
     for (default, meaning), alike in itertools.groupby(told, key=lambda row: row[1]):
-        yield f"| {', '.join(f'`{prefix}{name}`' for name, _ in alike)} | {default} | {meaning} |"
+        yield f"| {', '.join(f'`{name}`' for name, _ in alike)} | {default} | {meaning} |"
 
 
 def _rows_of_kinds(kinds):
@@ -98,20 +99,18 @@ def _default(value):
 
 
 def tables(model=PAGES["configuration.md"]):
-    """All tables, as they stand in the document; first that of the values outside every section.
-
-    Values of experts stand in the table of their section, if it has one, by their whole key.
-    """
-    parts = {}
+    """All tables, as they stand in the document: values outside every section, users' sections, experts' sections."""
+    parts = []
     for name, section in (("top level", model), *sections(model)):
-        if (users := name.removeprefix(_EXPERT)) != name and users in parts:
-            parts[users] += list(rows(section, f"{name}."))
-        elif lines := list(rows(section)):
+        if lines := list(rows(section)):
             about, columns = _OF_KINDS, "| key | kinds | default | meaning |\n|---|---|---|---|"
             if not isinstance(section, tuple):
                 about, columns = section.__doc__.strip().splitlines()[0], "| key | default | meaning |\n|---|---|---|"
-            parts[name] = [f"### {name}\n\n{about}\n\n{columns}", *lines]
-    return "\n".join("\n".join(lines) + "\n" for lines in parts.values())
+            if name.startswith(_EXPERT) and not any(part.startswith(_OF_EXPERTS) for part in parts):
+                parts.append(_OF_EXPERTS)
+            known = name.startswith(_EXPERT) and any(f"\n\n{about}\n\n" in part for part in parts)
+            parts.append("\n".join([f"### {name}\n", *([] if known else [f"{about}\n"]), columns, *lines]) + "\n")
+    return "\n".join(parts)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""docs/faults.md and the tests named after its rows agree."""
+"""docs/decisions/faults.md and the tests named after its rows agree."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import defaultdict
 from pathlib import Path
 
 TESTS = Path(__file__).resolve().parent
-PAGE = TESTS.parent / "docs" / "faults.md"
+PAGE = TESTS.parent / "docs" / "decisions" / "faults.md"
 _TEST = re.compile(r"^\s*def test((?:_(?:and|fault)_\d\d(?=_))+)_\w+\(", re.MULTILINE)
 _ROW = re.compile(r"^\| (\d+) \| [^|]+ \| [^|]+ \|$", re.MULTILINE)
 

@@ -42,13 +42,13 @@ class ReflectorsConfig(Section):
     """Reflectors seen by a laser scanner."""
 
     min_intensity: float | None = Field(
-        None, gt=0, le=1e9, description="of a beam that met a reflector; None: none is used"
+        None, gt=0, le=1e9, description="of a beam from a reflector; None: none is used"
     )
     size_m: float = Field(
         0.3,
         ge=0.01,
         le=5,
-        description="bright beams so near are one reflector; a wider spot is none",
+        description="largest reflector; nearer bright beams are one",
     )
     radius_m: float = Field(0.0, ge=0, le=2, description="of round reflectors: added to ranges")
     pose: tuple[_Metres, _Metres, Annotated[float, Field(ge=-7, le=7)]] | None = Field(

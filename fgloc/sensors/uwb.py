@@ -85,8 +85,8 @@ class UwbConfig(Section):
     non_line_of_sight: Literal["mixture", "reject"] = Field(
         "mixture", description="mixture: use too long ranges with nlos_*; reject: drop them"
     )
-    nlos_bias_m: float = Field(1.0, ge=0, le=100, description="such a range is too long by ...")
-    nlos_sigma_m: float = Field(3.0, ge=0.01, le=100, description="... and its sigma")
+    nlos_bias_m: float = Field(1.0, ge=0, le=100, description="mean excess of a range without line of sight")
+    nlos_sigma_m: float = Field(3.0, ge=0.01, le=100, description="sigma of this excess")
 
     def place_sigmas(self) -> dict[int, tuple[float, float, float]]:
         """Sigmas of x, y, z [m] of those anchors that are not known exactly."""

@@ -46,8 +46,8 @@ class NetworkConfig(Section):
     signal_edges_s: tuple[float, ...] = Field((0.0,), description="the same of measured signals, from 0")
     gyro_bias_sigma: float = Field(0.0, ge=0, description="error of the known bias, drawn in training")
     velocity_sigma: tuple[float, float] = Field((0.02, 0.05), description="noise of the velocity among the inputs")
-    velocity_decay_s: float = Field(0.3, gt=0, description="after it a measured velocity says little")
-    hold_s: float = Field(1.5, gt=0, description="a command holds so long without a next one")
+    velocity_decay_s: float = Field(0.3, gt=0, description="decay time of a measured velocity")
+    hold_s: float = Field(1.5, gt=0, description="longest time that a command is held")
 
     @model_validator(mode="after")
     def _may_be_an_ensemble(self) -> NetworkConfig:

@@ -101,9 +101,9 @@ class JointErrors(Section):
 class Split(Section):
     """Recordings by name."""
 
-    train: tuple[str, ...] = Field(description="the weights learn from these")
-    validation: tuple[str, ...] = Field(description="these say when to stop, and how sure the model may be")
-    test: tuple[str, ...] = Field((), description="these judge the model")
+    train: tuple[str, ...] = Field(description="weights are fitted to these")
+    validation: tuple[str, ...] = Field(description="early stopping, and the covariance's scale")
+    test: tuple[str, ...] = Field((), description="the model is evaluated on these")
 
 
 class ModelCard(Section):
