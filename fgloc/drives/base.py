@@ -38,14 +38,12 @@ class Equations:
     Attributes:
         A: ``(n, 3)``.
         b: ``(n,)`` m/s.
-        wheel: ``(n,)`` index of the wheel that each row is of; -1: of a wheel that measures nothing.
         A_by: derivatives ``(n, 3)`` by name of the parameter; one that is left out is zero.
         b_by: derivatives ``(n,)``, likewise.
     """
 
     A: FloatArray
     b: FloatArray
-    wheel: Sequence[int]
     A_by: dict[str, FloatArray] = field(default_factory=dict)
     b_by: dict[str, FloatArray] = field(default_factory=dict)
 

@@ -56,7 +56,7 @@ class Mecanum(Drive):
             "half_sum": np.column_stack([none, none, turning]),
             "lateral": np.column_stack([none, -sideways / self.lateral**2, none]),
         }
-        return Equations(A, self.radius * rates, range(4), A_by, {"radius": rates})
+        return Equations(A, self.radius * rates, A_by, {"radius": rates})
 
 
 class Omni(Drive):
@@ -84,7 +84,7 @@ class Omni(Drive):
         at, none = np.radians(self.angles_deg), np.zeros(len(rates))
         A = np.column_stack([-np.sin(at), np.cos(at), none + self.ring])
         A_by = {"ring": np.column_stack([none, none, none + 1.0])}
-        return Equations(A, self.radius * rates, range(len(rates)), A_by, {"radius": rates})
+        return Equations(A, self.radius * rates, A_by, {"radius": rates})
 
     @model_validator(mode="before")
     @classmethod
@@ -133,7 +133,7 @@ class Swerve(Steered):
             turned[n + i] = -c[i], -s[i], -self.size * along[i]
             A_by[f"steering_zeros_{i}"] = turned
         travel = np.append(rates, np.zeros(n))
-        return Equations(A, self.radius * travel, [*range(n), *range(n)], A_by, {"radius": travel})
+        return Equations(A, self.radius * travel, A_by, {"radius": travel})
 
     @model_validator(mode="before")
     @classmethod
