@@ -20,7 +20,7 @@ from fgloc.diagnosis.comparison import unit_of
 from fgloc.diagnosis.setup_fit import EXTRAS, Excerpt, Fit, Problem, Setup, Stretch, tells_place
 from fgloc.frames import OPTICAL_TO_BODY, homogeneous, quaternion_matrix, rotation_of, rpy_matrix, sensor_pose
 from fgloc.sensors.base import with_values
-from fgloc.sensors.wheels.sensor import SetupMistake, correct
+from fgloc.sensors.wheels.sensor import correct
 from fgloc.types import Camera, Finding, FloatArray, Landmark, LandmarkMap, Severity
 
 _WIDE = 0.5  # prior sigma of what may be grossly off: a share, rad, m or s
@@ -449,8 +449,7 @@ def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
 
 def _odometer(change: Change, given: Setup, source: str) -> Correction:
     factor = math.exp(change.setup.values.get(change.kind, 0.0))
-    mistake = SetupMistake(change.kind, factor, change.setup.turned, source)
-    found = correct(mistake, given.config)
+    found = correct(change.kind, factor, change.setup.turned, source == "ticks", given.config.wheels)
     value = factor if change.kind in ("radius", "track") else None
     return _set(given, found.code, found.sentence, found.section, found.values, value)
 

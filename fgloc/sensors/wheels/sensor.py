@@ -377,60 +377,45 @@ def _to_fill_in(pair: WheelPair | None) -> tuple[str, ...]:
 FIRST_SETTINGS = FirstSettings((JointsEvent, OdometryEvent, ControlEvent), _first_section)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SetupMistake:
-    """Mistake in the odometer's settings, as an excerpt of a recording shows it.
+def correct(kind: str, factor: float, turned: FloatArray, by_ticks: bool, wheels: WheelsConfig) -> RawMistake:
+    """Sentence for the user on a mistake in the odometer's settings, and the settings that correct it.
 
-    Attributes:
+    Args:
         kind: ``radius``, ``track``, ``odometry_frame``, or a key of `WRONG_SIDES`.
         factor: of radius and track: true over given.
         turned: of the others: what brings its twist ``(3,)`` into the base's axes, ``(3, 3)``.
-        source: of its motion, as `Odometer.source` has it.
+        by_ticks: whether its motion is that of the joints.
+        wheels: as given.
     """
-
-    kind: str
-    factor: float
-    turned: FloatArray
-    source: str
-
-
-def correct(mistake: SetupMistake, config: Config) -> RawMistake:
-    """Sentence for the user on a mistake, and the settings that correct it."""
-    wheels = config.wheels
-    match mistake.kind:
-        case "track":
-            return _track(mistake, wheels)
-        case "radius":
-            return _radius(mistake, wheels)
-        case "odometry_frame":
-            c, s = mistake.turned[:2, 0]
-            sentence = (
-                f"The odometry's twist is in axes turned by {-math.degrees(math.atan2(s, c)):.0f}° against the base: "
-                "set wheels.source: pose, or correct its child_frame_id."
-            )
-            return RawMistake("odometry.twist_frame", sentence, "wheels", {"source": "pose"})
-        case _:
-            return _sides(mistake, wheels)
-
-
-def _track(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    if mistake.source == "ticks" and wheels.track is not None:
-        new = {"track": wheels.track * mistake.factor}
-    else:
-        new = {"scale_omega": wheels.scale_omega / mistake.factor}
-    sentence = f"The wheels turn the robot {1.0 / mistake.factor:.3f} times as far as given: set {_lines(new)}."
-    return RawMistake("wheels.turn", sentence, "wheels", new)
-
-
-def _radius(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    factor = mistake.factor
-    if mistake.source == "ticks" and wheels.left_radius is not None and wheels.right_radius is not None:
-        new = {"left_radius": wheels.left_radius * factor, "right_radius": wheels.right_radius * factor}
-        sentence = f"The wheels' radii are {factor:.3f} times those given: set {_lines(new)}."
-    else:
-        new = {"scale_v": wheels.scale_v * factor, "scale_omega": wheels.scale_omega * factor}
-        sentence = f"The robot moves {factor:.3f} times as far as its odometry says: set {_lines(new)}."
-    return RawMistake("wheels.scale", sentence, "wheels", new)
+    new: dict[str, Any]
+    if kind == "track":
+        new = {"scale_omega": wheels.scale_omega / factor}
+        if by_ticks and wheels.track is not None:
+            new = {"track": wheels.track * factor}
+        sentence = f"The wheels turn the robot {1.0 / factor:.3f} times as far as given: set {_lines(new)}."
+        return RawMistake("wheels.turn", sentence, "wheels", new)
+    if kind == "radius":
+        by_radii = by_ticks and None not in (wheels.left_radius, wheels.right_radius)
+        keys = ("left_radius", "right_radius") if by_radii else ("scale_v", "scale_omega")
+        new = {key: getattr(wheels, key) * factor for key in keys}
+        sentence = (
+            f"The wheels' radii are {factor:.3f} times those given"
+            if by_radii
+            else f"The robot moves {factor:.3f} times as far as its odometry says"
+        )
+        return RawMistake("wheels.scale", f"{sentence}: set {_lines(new)}.", "wheels", new)
+    if kind == "odometry_frame":
+        c, s = turned[:2, 0]
+        sentence = (
+            f"The odometry's twist is in axes turned by {-math.degrees(math.atan2(s, c)):.0f}° against the base: "
+            "set wheels.source: pose, or correct its child_frame_id."
+        )
+        return RawMistake("odometry.twist_frame", sentence, "wheels", {"source": "pose"})
+    new = right_sides(kind, wheels) if by_ticks else {}
+    by_hand = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
+    line = f"set {_lines(new)}" if new else by_hand
+    code = "wheels.sign" if kind == "exchanged" else "wheels.reversed"
+    return RawMistake(code, f"The wheels {WRONG_SIDES[kind]}: {line}.", "wheels", new)
 
 
 WRONG_SIDES = {
@@ -464,15 +449,6 @@ def right_sides(kind: str, wheels: WheelsConfig) -> dict[str, Any]:
     if kind != "left_reversed":
         new["right_radius"] = -wheels.right_radius
     return new
-
-
-def _sides(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    """Sentence on wheels with sides exchanged or counts reversed, and the settings that correct it."""
-    new = right_sides(mistake.kind, wheels) if mistake.source == "ticks" else {}
-    by_hand = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
-    line = f"set {_lines(new)}" if new else by_hand
-    code = "wheels.sign" if mistake.kind == "exchanged" else "wheels.reversed"
-    return RawMistake(code, f"The wheels {WRONG_SIDES[mistake.kind]}: {line}.", "wheels", new)
 
 
 def _lines(values: Mapping[str, Any]) -> str:
