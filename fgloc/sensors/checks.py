@@ -99,8 +99,8 @@ def _indefinite(r: list[float], diagonal: list[float]) -> bool:
     return bool(np.linalg.eigvalsh(matrix, UPLO="L")[0] < -_INDEFINITE)
 
 
-def _listed(ids: Collection[int]) -> str:
-    """The first of some ids, for a sentence."""
+def listed(ids: Collection[int]) -> str:
+    """The first of some ids or numbers, for a sentence."""
     return ", ".join(map(str, sorted(ids)[:_SHOWN_IDS])) + (", ..." if len(ids) > _SHOWN_IDS else "")
 
 
@@ -138,7 +138,7 @@ class FieldChecks:
         """Note for the user on ids that were ignored, as the map does not have them; empty if there are none."""
         if not self._unknown:
             return ()
-        unknown, known = _listed(self._unknown), _listed(self._known or ())
+        unknown, known = listed(self._unknown), listed(self._known or ())
         if not self._any_known:
             return (Grave(f"none of the ids that were seen ({unknown}) is in the map, which has {known or 'none'}"),)
         return (f"sightings of ids that are not in the map are ignored: {unknown} (it has {known})",)
