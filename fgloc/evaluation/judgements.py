@@ -40,10 +40,6 @@ def _not_used(rows: Sequence[Decision], trajectory: Trajectory) -> str:
     return f"{plural(sum(d.weight == 0.0 for d in rows), 'sighting')} not used"
 
 
-def _found_again(rows: Sequence[Decision], trajectory: Trajectory) -> str:
-    return "mounting found again"
-
-
 def _left_out(rows: Sequence[Decision], trajectory: Trajectory) -> str:
     shifts = [d.shift_m for d in rows if math.isfinite(d.shift_m)]
     told = f"; would have moved the pose by {sum(shifts):+.3f} m forward" if shifts else ""
@@ -75,10 +71,6 @@ def _travelled(rows: Sequence[Decision], trajectory: Trajectory) -> str:
     return f"{way:.2f} m without a fix; position σ up to {_metres(sigma)}"
 
 
-def _clock(rows: Sequence[Decision], trajectory: Trajectory) -> str:
-    return "no motion connects the poses before and after"
-
-
 _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "motion_faulty": _left_out,
     "motion_overruled": _gone_to,
@@ -88,8 +80,8 @@ _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "lost": _travelled,
     "lifted": _travelled,
     "unconfirmed": _travelled,
-    "clock_jump": _clock,
-    "mounting_changed": _found_again,
+    "clock_jump": lambda rows, trajectory: "no motion connects the poses before and after",
+    "mounting_changed": lambda rows, trajectory: "mounting found again",
 }
 
 
