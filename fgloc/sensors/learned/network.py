@@ -368,16 +368,12 @@ class MotionModel(ABC):
         if end_ns <= start_ns:
             raise ModelError(f"the step ends at {end_ns} ns, not after its start {start_ns} ns")
         self._track = CommandHistory(commands) if self._track is None else self._track.following(commands)
-        return self._predict(self._track, start_ns, (end_ns - start_ns) * 1e-9, velocity, signals)
+        duration = (end_ns - start_ns) * 1e-9
+        return self._predict(self._track, start_ns, duration, velocity, signals or Signals(start_ns))
 
     @abstractmethod
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         """Motion over a duration [s], by the track of the commands; the rest as `predict` has it."""
 
@@ -442,12 +438,7 @@ class NaiveModel(MotionModel):
         self._noise = _noise(card)
 
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         n = sub_steps(duration, self.card.dt_s)
         limits = (start_ns - track.origin_ns) * 1e-9 + duration / n * np.arange(n + 1, dtype=np.float64)
@@ -475,12 +466,7 @@ class VelocityModel(MotionModel):
         self._gains = gains(card.kinematics)
 
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         start = (start_ns - track.origin_ns) * 1e-9
         if velocity is None:
@@ -560,12 +546,7 @@ class DisplacementModel(MotionModel):
         self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
 
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         n = sub_steps(duration, self.card.dt_s)
         dt = duration / n
@@ -612,22 +593,20 @@ class DisplacementModel(MotionModel):
             x[:, self._n_bins : self._n_told] = means[n:, 2].reshape(n, -1)
         return means[:n] @ self._gains, x
 
-    def _measured(self, base: FloatArray, x: Float32Array, signals: Signals | None, start_ns: int, dt: float) -> None:
+    def _measured(self, base: FloatArray, x: Float32Array, signals: Signals, start_ns: int, dt: float) -> None:
         """Fill the network's inputs from signals, and replace the twists that signals measure better than commands."""
         n, at = len(base), self._n_told
-        start = 0.0 if signals is None else (start_ns - signals.origin_ns) * 1e-9
-        starts = start + dt * np.arange(n, dtype=np.float64)
+        starts = (start_ns - signals.origin_ns) * 1e-9 + dt * np.arange(n, dtype=np.float64)
         for name in self.card.measured:
-            signal = None if signals is None else signals.named(name)
+            signal = signals.named(name)
             if signal is None:
                 raise ModelError(f"the model reads {name}, which the step has not; its inputs are {self.card.inputs}")
             features = signal_features(signal, starts, dt, self._signal_edges)
             x[:, at : at + features.shape[1]] = features
             at += features.shape[1]
-        if signals is not None:
-            base /= dt
-            measured_twists(base, self.card.wheel_kinematics, signals, starts, dt)
-            base *= dt
+        base /= dt
+        measured_twists(base, self.card.wheel_kinematics, signals, starts, dt)
+        base *= dt
 
     def _plan(self, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Linear maps by which one look-up in a track of commands serves n sub-steps.
