@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -107,7 +108,8 @@ def _named(
         return NamedDrive("tricycle", why, keys)
     if steering and wheels:
         rear = [name for name in wheels if not _FRONT.search(_words(name))] or wheels
-        keys = (_list("wheels", rear), _list("steering_joints", _by_side(steering)), "radius:  # m", "wheelbase:  # m")
+        by_side = sorted(steering, key=lambda name: bool(_RIGHT.search(_words(name))))
+        keys = (_list("wheels", rear), _list("steering_joints", by_side), "radius:  # m", "wheelbase:  # m")
         return NamedDrive("ackermann", f"steered by {' and '.join(steering)}", keys)
     placed = [
         [name for name in wheels if end.search(_words(name)) and side.search(_words(name))]
@@ -126,10 +128,6 @@ def _words(name: str) -> str:
 
 def _list(key: str, names: Sequence[str]) -> str:
     return f"{key}: [{', '.join(names)}]"
-
-
-def _by_side(names: Sequence[str]) -> list[str]:
-    return sorted(names, key=lambda name: bool(_RIGHT.search(_words(name))))
 
 
 def _four(joints: Sequence[JointsEvent], corner: Sequence[str]) -> NamedDrive | None:
@@ -154,14 +152,9 @@ def _four(joints: Sequence[JointsEvent], corner: Sequence[str]) -> NamedDrive | 
     return None
 
 
-def _values(joints: Sequence[JointsEvent], names: Sequence[str], what: str) -> FloatArray:
+def _values(joints: Sequence[JointsEvent], names: Sequence[str], what: Literal["position", "velocity"]) -> FloatArray:
     """Rows ``(n, joints)`` of what these joints report, where all of them do."""
-    rows = [
-        getattr(event, what)[[event.names.index(name) for name in names]]
-        for event in joints
-        if set(names) <= set(event.names) and len(getattr(event, what)) == len(event.names)
-    ]
-    table = np.array(rows, dtype=float).reshape(-1, len(names))
+    table = np.array([event.of(names, what) for event in joints], dtype=float).reshape(-1, len(names))
     return np.asarray(table[np.isfinite(table).all(axis=1)])
 
 

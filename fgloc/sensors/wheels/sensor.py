@@ -165,7 +165,7 @@ def fit_geometry(
         odometry: of the same drive, likewise.
         commands: likewise.
     """
-    angles = np.array([_angles(event, pair) for event in joints])
+    angles = np.array([event.of((pair.left, pair.right), "position") for event in joints])
     stamps = np.array([event.stamp_ns for event in joints], dtype=np.int64)
     keep = np.flatnonzero(np.diff(stamps, prepend=-1) > 0)
     if len(keep) < _FEWEST or len(odometry) < _FEWEST or not np.isfinite(angles[keep]).all():
@@ -263,14 +263,6 @@ def settings_of(events: Sequence[Event]) -> dict[str, Any] | None:
         "right_radius": right,
         "track": float(f"{found.track_m:.4g}"),
     }
-
-
-def _angles(event: JointsEvent, pair: WheelPair) -> tuple[float, float]:
-    def of(name: str) -> float:
-        i = event.names.index(name) if name in event.names else -1
-        return float(event.position[i]) if 0 <= i < len(event.position) else float("nan")
-
-    return of(pair.left), of(pair.right)
 
 
 def _slope(x: FloatArray, y: FloatArray) -> float | None:
