@@ -795,20 +795,16 @@ class Watch:
         bound = None if estimate.protection is None else NO_BOUND
         return replace(estimate, pose=pose, cov=turned, mode=Mode.DEAD_RECKONING, ground=ground, protection=bound)
 
-    @property
-    def sentence(self) -> str | None:
-        """Sentence on the times at which the odometry was given in place of the estimate; None: it never was."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Finding on the times at which the odometry was given in place of the estimate; empty if it never was."""
         if not self._spans:
-            return None
-        spans = ", ".join(f"{a:.0f} to {b:.0f} s" for a, b in self._spans[:_SPANS_TOLD])
-        return (
+            return ()
+        spans = ", ".join(f"{a:.0f} to {b:.0f} s" for a, b in self._spans)
+        text = (
             f"The estimate explains the recording worse than odometry alone, which is given in its place from {spans} "
             f"after the first pose: {self._why}."
         )
-
-    def findings(self) -> tuple[Finding, ...]:
-        """Finding on the times at which the odometry was given in place of the estimate; empty if it never was."""
-        return () if self.sentence is None else (Finding("sanity.odometry", self.sentence, Severity.ERROR),)
+        return (Finding("sanity.odometry", text, Severity.ERROR),)
 
     def _drive(self, step: Step, measured: MotionMeasurement, estimate: Estimate, finite: bool) -> None:
         """Add a step to the window, and close it where it is long enough."""
