@@ -16,7 +16,7 @@ from fgloc.drives.base import (
     Metres,
     Place,
     Steered,
-    same_length,
+    as_many_as_wheels,
 )
 
 _LATERAL_SIGMA = 0.03  # rollers creep
@@ -89,7 +89,7 @@ class Omni(Drive):
     @model_validator(mode="before")
     @classmethod
     def _alike(cls, content: object) -> object:
-        return same_length(content, "wheels", "angles_deg")
+        return as_many_as_wheels(content, "angles_deg")
 
 
 class Swerve(Steered):
@@ -139,7 +139,7 @@ class Swerve(Steered):
     @classmethod
     def _alike(cls, content: object) -> object:
         for key in ("steering_joints", "places"):
-            same_length(content, "wheels", key)
+            as_many_as_wheels(content, key)
         if isinstance(content, dict) and not content.get("steering_zeros"):
             content = content | {"steering_zeros": (0.0,) * len(content.get("wheels", ()))}
-        return same_length(content, "wheels", "steering_zeros")
+        return as_many_as_wheels(content, "steering_zeros")

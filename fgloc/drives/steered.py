@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from fgloc.drives.base import LENGTH_SIGMA, ZERO_SIGMA, Equations, FloatArray, Metres, Place, Steered, same_length
+from fgloc.drives.base import LENGTH_SIGMA, ZERO_SIGMA, Equations, FloatArray, Metres, Place, Steered, as_many_as_wheels
 
 _STRAIGHT = 1e-4  # of a sum of two tangents: below it both wheels point straight ahead
 _RATIO_SIGMA = 0.02
@@ -100,7 +100,7 @@ class Ackermann(_Axle):
     @classmethod
     def _alike(cls, content: object) -> object:
         if isinstance(content, dict) and content.get("wheel_y"):
-            return same_length({"wheels": ("speed",)} | content, "wheels", "wheel_y")
+            return as_many_as_wheels({"wheels": ("speed",)} | content, "wheel_y")
         return content
 
 
