@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fgloc import se2
-from fgloc.config import NoiseDensity
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Signals
@@ -432,18 +431,13 @@ def sub_steps(duration: float, longest_s: float) -> int:
 class NaiveModel(MotionModel):
     """The robot moves as commanded: v = u, in the model's kinematics. The baseline."""
 
-    def __init__(self, card: ModelCard) -> None:
-        """Take a checked card."""
-        super().__init__(card)
-        self._noise = _noise(card)
-
     def _predict(
         self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         n = sub_steps(duration, self.card.dt_s)
         limits = (start_ns - track.origin_ns) * 1e-9 + duration / n * np.arange(n + 1, dtype=np.float64)
         twists = calibrated(self.card.kinematics, track, limits)
-        return _prediction(twists, self._noise, duration / n, twists[-1, ::2])
+        return _prediction(twists, self.card, duration / n, twists[-1, ::2])
 
 
 class VelocityModel(MotionModel):
@@ -459,7 +453,6 @@ class VelocityModel(MotionModel):
         """Take a checked card and its network; None for a ``lag`` model."""
         super().__init__(card)
         self._network = network
-        self._noise = _noise(card)
         self._lag = None if card.lag is None else np.array(card.lag.lag_s)
         self._delay = card.kinematics.delay_s if card.lag is None else card.lag.delay_s
         self._scale = np.array(card.output_scale)
@@ -478,7 +471,7 @@ class VelocityModel(MotionModel):
         middles = 0.5 * (states[:-1] + states[1:])
         twists = np.zeros((len(middles), 3))
         twists[:, ::2] = middles
-        return _prediction(twists, self._noise, dt, states[-1])
+        return _prediction(twists, self.card, dt, states[-1])
 
     def _roll(self, track: CommandHistory, start: float, duration: float, velocity: FloatArray) -> FloatArray:
         """Velocities ``(n + 1, 2)`` at the limits of the n sub-steps."""
@@ -501,15 +494,10 @@ class VelocityModel(MotionModel):
         return states
 
 
-def _noise(card: ModelCard) -> NoiseDensity:
-    if card.noise is None:
-        raise ModelError(f"a {card.kind} model's card needs noise densities")
-    return card.noise
-
-
-def _prediction(twists: FloatArray, noise: NoiseDensity, dt: float, velocity: FloatArray) -> MotionPrediction:
-    """Motion of body twists ``(n, 3)``, each held for ``dt`` [s], with covariance."""
-    variances = np.array([noise.per_second(v, omega) for v, omega in twists[:, ::2].tolist()])
+def _prediction(twists: FloatArray, card: ModelCard, dt: float, velocity: FloatArray) -> MotionPrediction:
+    """Motion of body twists ``(n, 3)``, each held for ``dt`` [s], with covariance by the card's densities."""
+    assert card.noise is not None  # the card was checked
+    variances = np.array([card.noise.per_second(v, omega) for v, omega in twists[:, ::2].tolist()])
     return MotionPrediction(*composed((twists * dt).tolist(), (variances * dt).tolist()), velocity)
 
 
