@@ -55,11 +55,6 @@ class Change:
     free: Mapping[str, float] = field(default_factory=dict)
     has_gyro: bool = False
 
-    @property
-    def linearized(self) -> bool:
-        """Whether the fit is linear in an angle of the camera, so that it has to be repeated."""
-        return "camera.rx_rad" in self.free
-
 
 def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Iterator[Change]:
     """All changes that are tried on a set-up.
@@ -574,7 +569,7 @@ def _ended(change: Change, stretches: Sequence[Stretch], poses: FloatArray | Non
         change, poses = refined(change, fit), fit.poses
         done = last is not None and fit.cost > last.cost - _SAME
         last = fit
-        if done or not change.linearized:
+        if done or "camera.rx_rad" not in change.free:  # the fit is linear in the camera's angles
             break
     return None if last is None else (change, last)
 
