@@ -28,7 +28,6 @@ from fgloc import se2
 from fgloc.config import Config, camera_role
 from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
-from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
@@ -185,8 +184,7 @@ class Sanity:
         self._cameras = tuple(cameras)
         self._of_cameras = {camera_role(camera.name, "corners") for camera in cameras}
         self._place: FloatArray = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
-        sensor = LandmarkSensor(config, landmark_map, cameras, T_base_sensor)
-        self._collector = SightingCollector(config, landmark_map, sensor, self._place)
+        self._collector = SightingCollector(config, landmark_map, cameras, T_base_sensor, self._place)
         self._config, self._wheels, self._gyro = config, wheels, gyro
         self._landmarks = None
         if landmark_map is not None:
