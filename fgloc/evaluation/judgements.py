@@ -20,17 +20,6 @@ from fgloc.types import MOUNTING_CHANGED, Decision, IntArray, Trajectory
 # --- What a judgement cost or saved -----------------------------------------------------------------------------------
 
 
-def effect(kind: str, rows: Sequence[Decision], trajectory: Trajectory) -> str:
-    """In words: what became of the pose by this judgement.
-
-    Args:
-        kind: of the judgement.
-        rows: that it is made of, by time.
-        trajectory: of the run.
-    """
-    return _EFFECTS.get(kind, _not_used)(rows, trajectory)
-
-
 def plural(count: int, noun: str) -> str:
     """Number with its noun, in the plural unless it is 1."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
@@ -83,6 +72,7 @@ _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "clock_jump": lambda rows, trajectory: "no motion connects the poses before and after",
     "mounting_changed": lambda rows, trajectory: "mounting found again",
 }
+"""What became of the pose by a judgement, in words, by its kind: of its rows, by time, and the run's trajectory."""
 
 
 def _sigma_m(trajectory: Trajectory, stamp_ns: int, before: bool) -> float:
@@ -320,7 +310,7 @@ def _judgement(kind: Kind, subject: str, rows: Sequence[Decision], trajectory: T
         evidence=_evidence(rows, worst, statistic),
         statistic=statistic if math.isfinite(statistic) else None,
         threshold=worst.threshold if math.isfinite(worst.threshold) else None,
-        effect=effect(kind, rows, trajectory),
+        effect=_EFFECTS.get(kind, _not_used)(rows, trajectory),
     )
 
 
