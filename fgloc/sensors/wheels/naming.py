@@ -26,6 +26,7 @@ _STEERING = re.compile(r"steer", re.I)
 _DIAGONAL = 0.1  # share of four wheels' motion in which diagonal ones turn alike, against the others: rollers
 _SIDE = 0.02  # likewise that tells wheels of one side from one another: below it they turn alike
 _FEWEST = 50  # samples
+_NAMED_BY = 100  # messages whose joints are looked at: arm and wheels may take turns on a topic
 _ASIDE, _MOVES = 0.1, 0.05  # share of moving samples that go more sideways than ahead; m/s
 TICKS = "ticks_per_turn:  # positions are ticks: so many a turn of the wheel, or of the motor with radius over the gear"
 
@@ -43,6 +44,11 @@ class NamedDrive:
     kind: str
     why: str
     lines: tuple[str, ...]
+
+
+def joint_names(joints: Sequence[JointsEvent]) -> tuple[str, ...]:
+    """Names of the joints in the first messages, in their order."""
+    return tuple(dict.fromkeys(name for event in joints[:_NAMED_BY] for name in event.names))
 
 
 def goes_sideways(told: Sequence[Sequence[float]]) -> float | None:
@@ -76,7 +82,7 @@ def name_drive(
 
     Where positions are ticks, its lines have the ticks of a turn.
     """
-    names = tuple(dict.fromkeys(name for event in joints[:100] for name in event.names))
+    names = joint_names(joints)
     steering = [name for name in names if _STEERING.search(name)]
     wheels = [name for name in names if name not in steering and not re.search("arm|gripper|head", name, re.I)]
     wheels = [name for name in wheels if "wheel" in name.lower()] or wheels

@@ -43,7 +43,7 @@ from fgloc.sensors.wheels.events import (
     odometry_validator,
 )
 from fgloc.sensors.wheels.motion import INSTALLATION
-from fgloc.sensors.wheels.naming import TICKS, NamedDrive, count_ticks, name_drive
+from fgloc.sensors.wheels.naming import TICKS, NamedDrive, count_ticks, joint_names, name_drive
 from fgloc.sensors.wheels.tracks import wheel_names
 from fgloc.types import ControlEvent, Event, FloatArray
 
@@ -102,7 +102,6 @@ _FEWEST = 50  # messages of each, for a fit
 _FITS = 0.98  # share of the odometry's variance that the wheels must explain
 _CAUCHY, _ITERATIONS = 3.5, 5  # median absolute deviations beyond which a residual counts less: 95 % efficiency
 _LEAST_TURNING = 0.05  # rad/s: standard deviation of the yaw rate below which the track does not show
-NAMED_BY = 100  # messages whose joints are looked at: arm and wheels may take turns on a topic
 _WINDOW_S = 0.3  # over which rates are means: stamps of single messages jitter
 _STEADY_S = 1.0  # after a command: by then the wheels turn as they are told
 _ASKEW = 0.01  # rad: a pose whose heading is off its way by more has the heading from elsewhere
@@ -133,11 +132,6 @@ class WheelGeometry:
     radii_m: tuple[float, float]
     track_m: float
     by_commands: bool = False
-
-
-def joint_names(joints: Sequence[JointsEvent]) -> tuple[str, ...]:
-    """Names of the joints in the first messages, in their order."""
-    return tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
 
 
 def wheel_pair(names: Sequence[str]) -> WheelPair | None:
