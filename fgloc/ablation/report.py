@@ -23,7 +23,7 @@ from fgloc.ablation.jobs import Job, Record, Track, code_hash
 from fgloc.ablation.suite import NOTHING, Cell, Suite
 from fgloc.config import files_of
 from fgloc.evaluation.report import embedded, page
-from fgloc.evaluation.style import BLUE, DPI, GREEN, NORMAL, SMALL, WIDTH, Format, image_of, plain_label, png, tidy
+from fgloc.evaluation.style import BLUE, DPI, GREEN, NORMAL, SMALL, WIDTH, Format, image_of, plain_label, tidy
 from fgloc.files.atomic import atomic_folder
 from fgloc.files.outputs import sha256_of, write_json, write_text
 from fgloc.stats import rounded
@@ -563,7 +563,7 @@ def _page(
         f"{len(suite.failures)} failures, {len(suite.seeds)} seeds; {len(bad)} without a result."
     )
     head = ("failure", "severity", *(v.name for v in suite.variants))
-    pictures = [(heading, embedded(png(figure)), caption) for heading, figure, caption in drawn.values()]
+    pictures = [(heading, embedded(image_of(figure)), caption) for heading, figure, caption in drawn.values()]
     return page(
         "ablation.html",
         title=suite.title,

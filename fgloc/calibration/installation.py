@@ -22,7 +22,7 @@ from fgloc.frames import rotation_of, sensor_pose
 from fgloc.graph.contradictions import Contradiction
 from fgloc.graph.installation import MARKER, Installation, InstallationEstimate, camera_block
 from fgloc.sensors import odometry, registry
-from fgloc.sensors.base import InstallationState
+from fgloc.sensors.base import FoundRow, InstallationState
 from fgloc.sensors.cameras import pinhole
 from fgloc.sensors.wheels.motion import DRIVE
 from fgloc.stats import PRIOR_GATE, ROUNDING, SURE_SIGMAS, rounded
@@ -31,7 +31,6 @@ from fgloc.types import Camera, Finding, FloatArray, InstallationFound, Landmark
 Found = Mapping[str, tuple[float, float]]
 """Value and sigma by name."""
 
-_Row = tuple[str, str, float, float]  # name, parameter of the installation, value at 0, change by the parameter
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _OF_SIGHTINGS = {"range_scale": 1.0, "bearing_offset_rad": 0.0, "time_offset_s": 0.0, "x_m": 0.0, "y_m": 0.0}  # at 0
 
@@ -55,9 +54,8 @@ def found_values(
     - ``map.7.x``, ``.y``, ``.z`` [m]: of landmark 7.
     """
     motion = [row for made in registry.MOTION_INSTALLATIONS for row in made.found(config)]
-    sensed = [(row.name, row.parameter, row.at, row.gain) for row in registry.found_rows(config)]
-    sightings = [(f"sightings.{name}", f"sightings.{name}", at, 1.0) for name, at in _OF_SIGHTINGS.items()]
-    out = _values([*motion, *sensed, *sightings], installation, belief)
+    sightings = [FoundRow(f"sightings.{name}", f"sightings.{name}", at, 1.0) for name, at in _OF_SIGHTINGS.items()]
+    out = _values([*motion, *registry.found_rows(config), *sightings], installation, belief)
     for camera in cameras:
         if (block := camera_block(camera.name)) in installation.blocks:
             first = installation.blocks[block][0]
@@ -66,13 +64,13 @@ def found_values(
             out |= _values(_lens_rows(camera), installation, belief)
     for i in installation.landmarks if landmark_map is not None else ():
         at = landmark_map.landmarks[i].position.tolist()  # type: ignore[union-attr]
-        rows = [(f"map.{i}.{axis}", f"map.{i}.{axis}_m", value, 1.0) for axis, value in zip("xyz", at, strict=True)]
+        rows = [FoundRow(f"map.{i}.{a}", f"map.{i}.{a}_m", value, 1.0) for a, value in zip("xyz", at, strict=True)]
         out |= _values(rows, installation, belief)
     return out
 
 
 def _values(
-    rows: Iterable[_Row], installation: Installation, belief: InstallationEstimate
+    rows: Iterable[FoundRow], installation: Installation, belief: InstallationEstimate
 ) -> dict[str, tuple[float, float]]:
     """Value and sigma of those rows whose parameter is estimated."""
     sigma = np.sqrt(np.diag(belief.cov))
@@ -84,7 +82,7 @@ def _values(
     return out
 
 
-def _lens_rows(camera: Camera) -> list[_Row]:
+def _lens_rows(camera: Camera) -> list[FoundRow]:
     k1, k2 = np.concatenate([camera.D, np.zeros(2)])[:2]
     rows = [
         ("focal_scale", "focal", 1.0),
@@ -95,7 +93,7 @@ def _lens_rows(camera: Camera) -> list[_Row]:
         ("time_offset_s", "time_offset_s", 0.0),
     ]
     block = camera_block(camera.name)
-    return [(f"{block}.{name}", f"{block}.{parameter}", at, 1.0) for name, parameter, at in rows]
+    return [FoundRow(f"{block}.{name}", f"{block}.{parameter}", at, 1.0) for name, parameter, at in rows]
 
 
 def mounting(camera: Camera, mean: FloatArray, cov: FloatArray) -> Found:

@@ -166,8 +166,10 @@ def _clocks(
         )
         found.add("commands.delay", text, {"wheels.delay_s": delay_s}, of_all, Severity.WARNING)
         return of_all.value
-    wheels = WHEELS.get(path.source, "command")
-    if same or (len(late) == 1 and "imu" in off and _unpunctual(found.signals, wheels, "imu")):
+    wheels: Role = WHEELS.get(path.source, "command")
+    received = {role: abs(late_s) for role, late_s in found.signals.late_s().items()}  # after the stamp
+    odder = received.get(wheels, 0.0) > received.get("imu", 0.0) + LATE_S
+    if same or (len(late) == 1 and "imu" in off and odder):
         lag = of_all if same else off["imu"]
         _late(found, wheels, Figure(-lag.value, lag.sigma), " and ".join(off), len(late) == 1)
         return lag.value
@@ -184,12 +186,6 @@ def _alike(lag: Figure, other: Figure) -> bool:
 
 def _surely_late(lag: Figure) -> bool:
     return lag.off(0.0, LATE_S, _LATE_SIGMAS)
-
-
-def _unpunctual(signals: Signals, role: Role, other: Role) -> bool:
-    """Whether the first of two roles has the odder delay between stamp and receipt."""
-    late_s = signals.late_s()
-    return abs(late_s.get(role, 0.0)) > abs(late_s.get(other, 0.0)) + LATE_S
 
 
 def _late(found: Conventions, role: str, lag: Figure, against: str, either: bool) -> None:

@@ -169,7 +169,7 @@ def _turned(found: Conventions, drive: Drive, path: Path) -> _Turned | None:
     """Motion of the joints while they move; None: too few messages of it."""
     names = (*drive.driven, *drive.steered)
     events = [e for e in found.signals.motion if isinstance(e, JointsEvent) and {*names} <= {*e.names}]
-    rows = in_order([(e.stamp_ns, *_values(e, names, "position"), *_values(e, names, "velocity")) for e in events])
+    rows = in_order([(e.stamp_ns, *e.of(names, "position"), *e.of(names, "velocity")) for e in events])
     if len(rows) < _FEWEST:
         return None
     times, n, k = (rows[:, 0] - found.signals.origin_ns) * 1e-9, len(drive.driven), len(names)
@@ -199,8 +199,3 @@ def _turned(found: Conventions, drive: Drive, path: Path) -> _Turned | None:
     told = np.array([[drive.steering(value) for value in row] for row in steered.tolist()]).reshape(len(first), k - n)
     by_name = dict(zip(names, np.column_stack([means, told]).T, strict=True))
     return _Turned(first, first + _WINDOW_S, by_name)
-
-
-def _values(event: JointsEvent, names: Sequence[str], what: str) -> list[float]:
-    values: FloatArray = getattr(event, what)
-    return [float(values[event.names.index(n)]) if len(values) == len(event.names) else math.nan for n in names]

@@ -36,7 +36,6 @@ from fgloc.recording.reader import Recording, open_recording
 from fgloc.sensor_setup import SensorSetup, base_up, recorded_setup
 from fgloc.sensors.base import with_values
 from fgloc.sensors.cameras import marker_pose_candidates
-from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.markers.detector import RememberedDetections
 from fgloc.sensors.markers.images import CornersEvent, MarkerCorners
 from fgloc.sensors.wheels.sensor import mistakes
@@ -289,7 +288,7 @@ class _Search:
             code, severity = "markers.unseen", Severity.WARNING if vague else Severity.ERROR
             self._setup += note(code if fitting is None else "markers.dictionary", hints, severity)
         if fitting is not None:
-            self._change("markers", dictionary=fitting)
+            self.config = with_values(self.config, "markers", {"dictionary": fitting})
         return fitting is not None
 
     def _fit(self, recording: Recording, excerpt: Excerpt, parts: SensorSetup) -> None:
@@ -337,8 +336,7 @@ class _Search:
         (camera,), landmark_map = parts.cameras, parts.landmark_map
         assert landmark_map is not None
         config = with_values(self.config, "recording", {"sightings_axes": "optical"})
-        sensor = LandmarkSensor(config, landmark_map, camera, None)  # what it refuses does not count
-        corners = SightingCollector(config, landmark_map, sensor, camera.T_base_cam)
+        corners = SightingCollector(config, landmark_map, (camera,), None, camera.T_base_cam)
         signals = replace(excerpt.signals, seen=[], spatial=True)
         for picture in (p for row in excerpt.pictures for p in row):
             event = CornersEvent(picture.stamp_ns, picture.stamp_ns, "", "", picture.seen)
@@ -371,9 +369,6 @@ class _Search:
     def _correct(self, code: str, text: str, section: str, **values: object) -> None:
         lines = shown(section, {key: value for key, value in values.items() if value is not None})
         self._setup.append(Finding(code, text, Severity.ERROR, lines))
-        self._change(section, **values)
-
-    def _change(self, section: str, **values: object) -> None:
         self.config = with_values(self.config, section, values)
 
 
@@ -420,9 +415,8 @@ class Diagnosis:
         if camera is not None:
             self._config = with_values(config, "recording", {"sightings_axes": "optical"})
             self._place = camera.T_base_cam
-        sensor = LandmarkSensor(config, landmark_map, camera, T_base_sensor)  # what it refuses does not count
-        place = np.eye(4) if camera is None else camera.T_base_cam
-        self._corners = SightingCollector(config, landmark_map, sensor, place)  # they are in the camera's axes
+        cameras, place = ((), np.eye(4)) if camera is None else ((camera,), camera.T_base_cam)  # the camera's axes
+        self._corners = SightingCollector(config, landmark_map, cameras, T_base_sensor, place)
         self._signals = SignalCollector(config)
         self._began_ns: int | None = None
         self._span_s, self._looked_s, self._compared_s = 0.0, -math.inf, 0.0

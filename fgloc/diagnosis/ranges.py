@@ -20,7 +20,8 @@ from scipy.optimize import least_squares
 from fgloc.diagnosis.comparison import Conventions
 from fgloc.diagnosis.pairs import MAD, ComplexArray, Figure, jackknife
 from fgloc.diagnosis.signals import GRID_S, Path, in_order
-from fgloc.sensors.uwb import UNITS, numbers, usual_unit
+from fgloc.sensors.checks import listed
+from fgloc.sensors.uwb import UNITS, usual_unit
 from fgloc.types import FloatArray, Severity
 
 _MOST_STRETCHES, _FEWEST_STRETCHES = 12, 4
@@ -251,8 +252,8 @@ def check_radio(found: Conventions) -> None:
         found.signals = replace(found.signals, ranges=[(t, i, r * unit) for t, i, r in rows])
     if section.anchors and not section.anchors.keys() & set(heard):
         text = (
-            f"None of the anchors that are heard ({numbers(heard)}) is in uwb.anchors, which has "
-            f"{numbers(section.anchors)}: no range is used. Give places by the numbers that the messages have (the "
+            f"None of the anchors that are heard ({listed(heard)}) is in uwb.anchors, which has "
+            f"{listed(section.anchors)}: no range is used. Give places by the numbers that the messages have (the "
             "figures at the end of frame_id, else in the topic's name)"
         )
         found.add("uwb.other_ids", text)

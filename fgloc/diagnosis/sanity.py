@@ -28,7 +28,6 @@ from fgloc import se2
 from fgloc.config import Config, camera_role
 from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
-from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.gyro import Gyro
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
@@ -185,8 +184,7 @@ class Sanity:
         self._cameras = tuple(cameras)
         self._of_cameras = {camera_role(camera.name, "corners") for camera in cameras}
         self._place: FloatArray = np.eye(4) if T_base_sensor is None else np.asarray(T_base_sensor, dtype=float)
-        sensor = LandmarkSensor(config, landmark_map, cameras, T_base_sensor)
-        self._collector = SightingCollector(config, landmark_map, sensor, self._place)
+        self._collector = SightingCollector(config, landmark_map, cameras, T_base_sensor, self._place)
         self._config, self._wheels, self._gyro = config, wheels, gyro
         self._landmarks = None
         if landmark_map is not None:
@@ -795,20 +793,16 @@ class Watch:
         bound = None if estimate.protection is None else NO_BOUND
         return replace(estimate, pose=pose, cov=turned, mode=Mode.DEAD_RECKONING, ground=ground, protection=bound)
 
-    @property
-    def sentence(self) -> str | None:
-        """Sentence on the times at which the odometry was given in place of the estimate; None: it never was."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Finding on the times at which the odometry was given in place of the estimate; empty if it never was."""
         if not self._spans:
-            return None
-        spans = ", ".join(f"{a:.0f} to {b:.0f} s" for a, b in self._spans[:_SPANS_TOLD])
-        return (
+            return ()
+        spans = ", ".join(f"{a:.0f} to {b:.0f} s" for a, b in self._spans)
+        text = (
             f"The estimate explains the recording worse than odometry alone, which is given in its place from {spans} "
             f"after the first pose: {self._why}."
         )
-
-    def findings(self) -> tuple[Finding, ...]:
-        """Finding on the times at which the odometry was given in place of the estimate; empty if it never was."""
-        return () if self.sentence is None else (Finding("sanity.odometry", self.sentence, Severity.ERROR),)
+        return (Finding("sanity.odometry", text, Severity.ERROR),)
 
     def _drive(self, step: Step, measured: MotionMeasurement, estimate: Estimate, finite: bool) -> None:
         """Add a step to the window, and close it where it is long enough."""

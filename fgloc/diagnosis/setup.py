@@ -20,7 +20,7 @@ from fgloc.diagnosis.comparison import unit_of
 from fgloc.diagnosis.setup_fit import EXTRAS, Excerpt, Fit, Problem, Setup, Stretch, tells_place
 from fgloc.frames import OPTICAL_TO_BODY, homogeneous, quaternion_matrix, rotation_of, rpy_matrix, sensor_pose
 from fgloc.sensors.base import with_values
-from fgloc.sensors.wheels.sensor import SetupMistake, correct
+from fgloc.sensors.wheels.sensor import correct
 from fgloc.types import Camera, Finding, FloatArray, Landmark, LandmarkMap, Severity
 
 _WIDE = 0.5  # prior sigma of what may be grossly off: a share, rad, m or s
@@ -54,11 +54,6 @@ class Change:
     setup: Setup
     free: Mapping[str, float] = field(default_factory=dict)
     has_gyro: bool = False
-
-    @property
-    def linearized(self) -> bool:
-        """Whether the fit is linear in an angle of the camera, so that it has to be repeated."""
-        return "camera.rx_rad" in self.free
 
 
 def changes(setup: Setup, fit: Fit | None, source: str, has_gyro: bool) -> Iterator[Change]:
@@ -449,8 +444,7 @@ def _clock(given: Setup, role: Role, name: str, late_s: float) -> Correction:
 
 def _odometer(change: Change, given: Setup, source: str) -> Correction:
     factor = math.exp(change.setup.values.get(change.kind, 0.0))
-    mistake = SetupMistake(change.kind, factor, change.setup.turned, source)
-    found = correct(mistake, given.config)
+    found = correct(change.kind, factor, change.setup.turned, source == "ticks", given.config.wheels)
     value = factor if change.kind in ("radius", "track") else None
     return _set(given, found.code, found.sentence, found.section, found.values, value)
 
@@ -575,7 +569,7 @@ def _ended(change: Change, stretches: Sequence[Stretch], poses: FloatArray | Non
         change, poses = refined(change, fit), fit.poses
         done = last is not None and fit.cost > last.cost - _SAME
         last = fit
-        if done or not change.linearized:
+        if done or "camera.rx_rad" not in change.free:  # the fit is linear in the camera's angles
             break
     return None if last is None else (change, last)
 

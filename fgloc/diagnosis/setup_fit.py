@@ -68,14 +68,12 @@ class Stretch:
         pictures: the images.
         wheels: ``(g, 3)`` twist times time of each grid interval, as configured.
         gyro: ``(g,)`` rotation [rad] of each grid interval; None: there is no gyro.
-        start_ns: stamp of the first grid point.
     """
 
     times: FloatArray
     pictures: tuple[Picture, ...]
     wheels: FloatArray
     gyro: FloatArray | None
-    start_ns: int
 
 
 @dataclass
@@ -185,7 +183,7 @@ def _stretch(excerpt: Excerpt, pictures: list[Picture], config: Config, imu_up: 
         return None
     gyro = None if imu_up is None else _gyro_increments(excerpt.signals, imu_up, grid)
     times = np.array([(p.stamp_ns - start_ns) * 1e-9 for p in pictures])
-    return Stretch(times, tuple(pictures), wheels, gyro, start_ns)
+    return Stretch(times, tuple(pictures), wheels, gyro)
 
 
 def wheel_increments(excerpt: Excerpt, config: Config, grid: IntArray) -> FloatArray | None:

@@ -23,6 +23,7 @@ from fgloc.sensors.uwb import UwbEvent
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import (
+    Camera,
     ControlEvent,
     Event,
     FloatArray,
@@ -385,13 +386,16 @@ class SightingCollector:
     """Turns sightings events into places in the sensor's own axes."""
 
     def __init__(
-        self, config: Config, landmark_map: LandmarkMap | None, sensor: LandmarkSensor, T_base_sensor: FloatArray
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        cameras: Sequence[Camera],
+        T_base_sensor: FloatArray | None,
+        place: FloatArray,
     ) -> None:
-        """Set up; ``sensor`` is this object's own, as it counts what it rejects."""
-        self._config = config
-        self._map = landmark_map
-        self._sensor = sensor
-        self._place = T_base_sensor
+        """Set up for the sightings that a `LandmarkSensor` measures; ``place (4, 4)`` has the axes asked for."""
+        self._config, self._map, self._place = config, landmark_map, place
+        self._sensor = LandmarkSensor(config, landmark_map, cameras, T_base_sensor)  # what it rejects does not count
 
     def sightings(self, event: SightingsEvent) -> Iterator[RelativeSighting]:
         """Place and noise of each landmark of a sightings event, in the sensor's axes."""

@@ -35,7 +35,7 @@ def check_steering(found: Conventions, path: Path) -> Path:
         return path  # either may be wrong
     text = "The steering counts to the other side than gyro and truth, which agree"
     found.add("wheels.sign", text, {"wheels.drive.steering_ratio": -drive.steering_ratio})
-    return found.signals.path(found.config) or path
+    return found.read_again(path)
 
 
 def _by_size(found: Conventions, path: Path, turn: Figure, way: Figure | None) -> Path:
@@ -70,7 +70,7 @@ def _by_size(found: Conventions, path: Path, turn: Figure, way: Figure | None) -
     else:
         text = f"{said}: wheels.drive.steering_ratio or wheelbase is wrong by as much"
         found.add("wheels.wheelbase", text, None, turn)
-    return found.signals.path(found.config) or path
+    return found.read_again(path)
 
 
 def _in_degrees(found: Conventions, path: Path, drive: Ackermann | Tricycle) -> Path:

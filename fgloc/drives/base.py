@@ -38,14 +38,12 @@ class Equations:
     Attributes:
         A: ``(n, 3)``.
         b: ``(n,)`` m/s.
-        wheel: ``(n,)`` index of the wheel that each row is of; -1: of a wheel that measures nothing.
         A_by: derivatives ``(n, 3)`` by name of the parameter; one that is left out is zero.
         b_by: derivatives ``(n,)``, likewise.
     """
 
     A: FloatArray
     b: FloatArray
-    wheel: Sequence[int]
     A_by: dict[str, FloatArray] = field(default_factory=dict)
     b_by: dict[str, FloatArray] = field(default_factory=dict)
 
@@ -187,14 +185,14 @@ class Steered(Drive):
         return math.remainder(reported, self.steering_ticks) / self.steering_ticks * math.tau
 
 
-def same_length(content: object, first: str, second: str) -> object:
+def as_many_as_wheels(content: object, key: str) -> object:
     """The section as it is.
 
     Raises:
-        ValueError: two of its lists differ in length.
+        ValueError: this list of it is not as long as that of the wheels.
     """
     if isinstance(content, dict):
-        a, b = content.get(first), content.get(second)
+        a, b = content.get("wheels"), content.get(key)
         if isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) != len(b):
-            raise ValueError(f"{first} has {len(a)} entries and {second} {len(b)}; expected one of each for each wheel")
+            raise ValueError(f"wheels has {len(a)} entries and {key} {len(b)}; expected one of each for each wheel")
     return content

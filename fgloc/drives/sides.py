@@ -35,9 +35,7 @@ class _Sides(Drive):
         A[n] = 0.0, 1.0, self.axle_x
         by_track, by_axle = np.zeros((n + 1, 3)), np.zeros((n + 1, 3))
         by_track[:n, 2], by_axle[n, 2] = 0.5 * side, 1.0
-        return Equations(
-            A, b, [*range(n), -1], {"track": by_track, "axle_x": by_axle}, {"radius": np.append(rates, 0.0)}
-        )
+        return Equations(A, b, {"track": by_track, "axle_x": by_axle}, {"radius": np.append(rates, 0.0)})
 
 
 class Differential(_Sides):

@@ -16,7 +16,7 @@ from fgloc.drives.base import (
     Metres,
     Place,
     Steered,
-    same_length,
+    as_many_as_wheels,
 )
 
 _LATERAL_SIGMA = 0.03  # rollers creep
@@ -56,7 +56,7 @@ class Mecanum(Drive):
             "half_sum": np.column_stack([none, none, turning]),
             "lateral": np.column_stack([none, -sideways / self.lateral**2, none]),
         }
-        return Equations(A, self.radius * rates, range(4), A_by, {"radius": rates})
+        return Equations(A, self.radius * rates, A_by, {"radius": rates})
 
 
 class Omni(Drive):
@@ -84,12 +84,12 @@ class Omni(Drive):
         at, none = np.radians(self.angles_deg), np.zeros(len(rates))
         A = np.column_stack([-np.sin(at), np.cos(at), none + self.ring])
         A_by = {"ring": np.column_stack([none, none, none + 1.0])}
-        return Equations(A, self.radius * rates, range(len(rates)), A_by, {"radius": rates})
+        return Equations(A, self.radius * rates, A_by, {"radius": rates})
 
     @model_validator(mode="before")
     @classmethod
     def _alike(cls, content: object) -> object:
-        return same_length(content, "wheels", "angles_deg")
+        return as_many_as_wheels(content, "angles_deg")
 
 
 class Swerve(Steered):
@@ -133,13 +133,13 @@ class Swerve(Steered):
             turned[n + i] = -c[i], -s[i], -self.size * along[i]
             A_by[f"steering_zeros_{i}"] = turned
         travel = np.append(rates, np.zeros(n))
-        return Equations(A, self.radius * travel, [*range(n), *range(n)], A_by, {"radius": travel})
+        return Equations(A, self.radius * travel, A_by, {"radius": travel})
 
     @model_validator(mode="before")
     @classmethod
     def _alike(cls, content: object) -> object:
         for key in ("steering_joints", "places"):
-            same_length(content, "wheels", key)
+            as_many_as_wheels(content, key)
         if isinstance(content, dict) and not content.get("steering_zeros"):
             content = content | {"steering_zeros": (0.0,) * len(content.get("wheels", ()))}
-        return same_length(content, "wheels", "steering_zeros")
+        return as_many_as_wheels(content, "steering_zeros")

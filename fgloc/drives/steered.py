@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from fgloc.drives.base import LENGTH_SIGMA, ZERO_SIGMA, Equations, FloatArray, Metres, Place, Steered, same_length
+from fgloc.drives.base import LENGTH_SIGMA, ZERO_SIGMA, Equations, FloatArray, Metres, Place, Steered, as_many_as_wheels
 
 _STRAIGHT = 1e-4  # of a sum of two tangents: below it both wheels point straight ahead
 _RATIO_SIGMA = 0.02
@@ -77,7 +77,7 @@ class Ackermann(_Axle):
         moved[n, 2], moved[n + 1, 2] = c, 1.0
         A_by = {"steering_zero": by_zero * turned, "steering_ratio": by_ratio * turned}
         A_by |= {"wheelbase": longer, "axle_x": moved}
-        return Equations(A, b, [*range(n), -1, -1], A_by, {"radius": np.append(rates, (0.0, 0.0))})
+        return Equations(A, b, A_by, {"radius": np.append(rates, (0.0, 0.0))})
 
     def _angle(self, reported: FloatArray) -> tuple[float, float, float]:
         """Angle of a wheel in the middle of the front axle [rad], and its derivatives by steering_zero and _ratio.
@@ -100,7 +100,7 @@ class Ackermann(_Axle):
     @classmethod
     def _alike(cls, content: object) -> object:
         if isinstance(content, dict) and content.get("wheel_y"):
-            return same_length({"wheels": ("speed",)} | content, "wheels", "wheel_y")
+            return as_many_as_wheels({"wheels": ("speed",)} | content, "wheel_y")
         return content
 
 
@@ -132,4 +132,4 @@ class Tricycle(_Axle):
         A_by = {"steering_zero": turned, "steering_ratio": float(angles[0]) * turned}
         A_by |= {"wheelbase": longer, "axle_x": moved}
         travel = np.array([float(rates[0]), 0.0, 0.0])
-        return Equations(A, self.radius * travel, [0, -1, -1], A_by, {"radius": travel})
+        return Equations(A, self.radius * travel, A_by, {"radius": travel})

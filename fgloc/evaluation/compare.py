@@ -78,13 +78,17 @@ def compare(folders: Sequence[Path]) -> list[Compared]:
 
 
 def _held(name: str, one: Results, first: Results) -> Compared:
-    base, own = first.trajectory, one.trajectory
-    k = matchable(own, base, _BRIDGED_S) if one is not first else np.array([], dtype=np.int64)
-    apart = np.zeros(0)
-    if len(k):
-        there = se2.interpolate(base.stamps_ns, base.poses, own.stamps_ns[k])
-        apart = np.hypot(*(own.poses[k] - there)[:, :2].T)
-    return Compared(name, one, _truth(one), own.stamps_ns[k], apart)
+    stamps, apart = np.array([], dtype=np.int64), np.zeros(0)
+    if one is not first:
+        stamps, apart = _distances(one.trajectory, first.trajectory)
+    return Compared(name, one, _truth(one), stamps, apart)
+
+
+def _distances(own: Trajectory, other: Trajectory) -> tuple[IntArray, FloatArray]:
+    """Stamps ``(k,)`` of a trajectory at which there is another one, and its distances ``(k,)`` [m] from that."""
+    k = matchable(own, other, _BRIDGED_S)
+    there = se2.interpolate(other.stamps_ns, other.poses, own.stamps_ns[k]) if len(k) else np.zeros((0, 3))
+    return own.stamps_ns[k], np.hypot(*(own.poses[k] - there)[:, :2].T)
 
 
 def remarks(runs: Sequence[Compared]) -> list[str]:
@@ -158,9 +162,8 @@ def plot_comparison(runs: Sequence[Compared]) -> Figure:
             *broken(own.stamps_ns, own.poses[:, :2]).T, color=color, ls=dashes, lw=1.2, label=plain_label(run.name)
         )
         stamps, off = run.apart_ns, run.apart
-        if run.truth is not None and len(k := matchable(own, run.truth, _BRIDGED_S)):
-            true = se2.interpolate(run.truth.stamps_ns, run.truth.poses, own.stamps_ns[k])
-            stamps, off = own.stamps_ns[k], np.hypot(*(own.poses[k] - true)[:, :2].T)
+        if run.truth is not None and len((to_truth := _distances(own, run.truth))[0]):
+            stamps, off = to_truth
         if len(stamps):
             times = broken(stamps, np.column_stack([(stamps - start) * 1e-9, off]))
             error.plot(*times.T, color=color, ls=dashes, lw=1.0)

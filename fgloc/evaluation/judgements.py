@@ -20,17 +20,6 @@ from fgloc.types import MOUNTING_CHANGED, Decision, IntArray, Trajectory
 # --- What a judgement cost or saved -----------------------------------------------------------------------------------
 
 
-def effect(kind: str, rows: Sequence[Decision], trajectory: Trajectory) -> str:
-    """In words: what became of the pose by this judgement.
-
-    Args:
-        kind: of the judgement.
-        rows: that it is made of, by time.
-        trajectory: of the run.
-    """
-    return _EFFECTS.get(kind, _not_used)(rows, trajectory)
-
-
 def plural(count: int, noun: str) -> str:
     """Number with its noun, in the plural unless it is 1."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
@@ -38,10 +27,6 @@ def plural(count: int, noun: str) -> str:
 
 def _not_used(rows: Sequence[Decision], trajectory: Trajectory) -> str:
     return f"{plural(sum(d.weight == 0.0 for d in rows), 'sighting')} not used"
-
-
-def _found_again(rows: Sequence[Decision], trajectory: Trajectory) -> str:
-    return "mounting found again"
 
 
 def _left_out(rows: Sequence[Decision], trajectory: Trajectory) -> str:
@@ -75,10 +60,6 @@ def _travelled(rows: Sequence[Decision], trajectory: Trajectory) -> str:
     return f"{way:.2f} m without a fix; position σ up to {_metres(sigma)}"
 
 
-def _clock(rows: Sequence[Decision], trajectory: Trajectory) -> str:
-    return "no motion connects the poses before and after"
-
-
 _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "motion_faulty": _left_out,
     "motion_overruled": _gone_to,
@@ -88,9 +69,10 @@ _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "lost": _travelled,
     "lifted": _travelled,
     "unconfirmed": _travelled,
-    "clock_jump": _clock,
-    "mounting_changed": _found_again,
+    "clock_jump": lambda rows, trajectory: "no motion connects the poses before and after",
+    "mounting_changed": lambda rows, trajectory: "mounting found again",
 }
+"""What became of the pose by a judgement, in words, by its kind: of its rows, by time, and the run's trajectory."""
 
 
 def _sigma_m(trajectory: Trajectory, stamp_ns: int, before: bool) -> float:
@@ -328,7 +310,7 @@ def _judgement(kind: Kind, subject: str, rows: Sequence[Decision], trajectory: T
         evidence=_evidence(rows, worst, statistic),
         statistic=statistic if math.isfinite(statistic) else None,
         threshold=worst.threshold if math.isfinite(worst.threshold) else None,
-        effect=effect(kind, rows, trajectory),
+        effect=_EFFECTS.get(kind, _not_used)(rows, trajectory),
     )
 
 

@@ -26,7 +26,7 @@ from fgloc.evaluation.interactive import interactive
 from fgloc.evaluation.judgements import GRAVITY, Judgement, numbered
 from fgloc.evaluation.metrics import Matched, Metrics, compute_metrics, match_result
 from fgloc.evaluation.plots import plot_error, plot_height, plot_protection, plot_space, plot_timeline, plot_trajectory
-from fgloc.evaluation.style import FORMATS, Format, image_of, png
+from fgloc.evaluation.style import FORMATS, Format, image_of
 from fgloc.files.atomic import atomic_folder
 from fgloc.files.outputs import (
     RESULT_FORMAT,
@@ -336,7 +336,7 @@ def write_results(
     metrics, matched = compute_metrics(result, config), match_result(result, config)
     provenance = _provenance(result, config, command, input_hash)
     drawn = _drawn(result, matched, config)
-    images = {f"{name}.png": png(figure) for name, figure in drawn.items()}
+    images = {f"{name}.png": image_of(figure) for name, figure in drawn.items()}
     files = {f"{name}.{form}": image_of(figure, form) for form in figures for name, figure in drawn.items()}
     with atomic_folder(out, own=FILES) as stage:
         write_tum(stage / "trajectory.tum", result.trajectory)

@@ -45,7 +45,7 @@ _UNDATED: dict[Format, dict[str, None]] = {
 _FILES: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "fgloc", "pdf.fonttype": 42}
 
 
-def image_of(figure: Figure, form: Format) -> bytes:
+def image_of(figure: Figure, form: Format = "png") -> bytes:
     """A figure as a file, the same bytes for the same figure."""
     buffer = io.BytesIO()
     if (layout := figure.get_layout_engine()) is not None:  # once: `savefig` would draw all of it once more for that
@@ -54,11 +54,6 @@ def image_of(figure: Figure, form: Format) -> bytes:
     with rc_context(_FILES):
         figure.savefig(buffer, format=form, metadata=_UNDATED[form])
     return buffer.getvalue()
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as PNG."""
-    return image_of(figure, "png")
 
 
 def plain_label(text: str, longest: int = _LONGEST_LABEL) -> str:

@@ -33,15 +33,6 @@ _KEPT_IDS = 1000
 E = TypeVar("E", bound=SightingsEvent)
 
 
-def judge_quaternion(quaternion: FloatArray, tolerance: float) -> FloatArray | str:
-    """The quaternion ``(4,)``, made exactly unit if its norm is within ``tolerance`` of 1."""
-    x, y, z, w = quaternion.tolist()
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    if not abs(norm - 1.0) <= tolerance:  # also NaN
-        return "quaternion" if math.isfinite(norm) else "non_finite"
-    return quaternion if abs(norm - 1.0) <= 1e-6 else quaternion / norm
-
-
 def judge_covariance(cov: FloatArray, axes: Sequence[int], max_variance: float) -> tuple[FloatArray | str, str]:
     """Judge the block of a covariance that somebody will read.
 
@@ -99,8 +90,8 @@ def _indefinite(r: list[float], diagonal: list[float]) -> bool:
     return bool(np.linalg.eigvalsh(matrix, UPLO="L")[0] < -_INDEFINITE)
 
 
-def _listed(ids: Collection[int]) -> str:
-    """The first of some ids, for a sentence."""
+def listed(ids: Collection[int]) -> str:
+    """The first of some ids or numbers, for a sentence."""
     return ", ".join(map(str, sorted(ids)[:_SHOWN_IDS])) + (", ..." if len(ids) > _SHOWN_IDS else "")
 
 
@@ -109,6 +100,7 @@ class FieldChecks:
 
     Attributes:
         config: bounds.
+        note: adds a note for the user.
         rejections: parts of events that were rejected, by "role.reason"; whole events are counted by `EventValidator`.
     """
 
@@ -127,7 +119,7 @@ class FieldChecks:
         self._named = named or {}
         self.config = config
         self.rejections: Counter[str] = Counter() if rejections is None else rejections
-        self._note = note
+        self.note = note
         self._known = None if known_ids is None else frozenset(known_ids)
         self._unknown: set[int] = set()
         self._any_known = False
@@ -138,14 +130,10 @@ class FieldChecks:
         """Note for the user on ids that were ignored, as the map does not have them; empty if there are none."""
         if not self._unknown:
             return ()
-        unknown, known = _listed(self._unknown), _listed(self._known or ())
+        unknown, known = listed(self._unknown), listed(self._known or ())
         if not self._any_known:
             return (Grave(f"none of the ids that were seen ({unknown}) is in the map, which has {known or 'none'}"),)
         return (f"sightings of ids that are not in the map are ignored: {unknown} (it has {known})",)
-
-    def note(self, text: str) -> None:
-        """Add a note for the user."""
-        self._note(text)
 
     def sift(self, event: E, judge: Callable[[str, Any], Sighting | str]) -> E | str:
         """The event, a copy without the bad entries, or the reason for rejection.
@@ -181,12 +169,13 @@ class FieldChecks:
         return True
 
     def quaternion(self, quaternion: FloatArray, name: str, changes: Changes) -> str:
-        """Check a quaternion: reason for rejection or ""; a repaired copy goes into ``changes[name]``."""
-        verdict = judge_quaternion(quaternion, self.config.quaternion_tolerance)
-        if isinstance(verdict, str):
-            return verdict
-        if verdict is not quaternion:
-            changes[name] = verdict
+        """Check a quaternion ``(4,)``: reason for rejection or ""; one made unit goes into ``changes[name]``."""
+        x, y, z, w = quaternion.tolist()
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        if not abs(norm - 1.0) <= self.config.quaternion_tolerance:  # also NaN
+            return "quaternion" if math.isfinite(norm) else "non_finite"
+        if abs(norm - 1.0) > 1e-6:
+            changes[name] = quaternion / norm
         return ""
 
     def covariance(
@@ -201,7 +190,7 @@ class FieldChecks:
         else:
             verdict, was = judge_covariance(cov, axes, self.config.max_variance)
             if was:
-                self._note(f"{topic}: {what} covariance is {was}; the configured default is used")
+                self.note(f"{topic}: {what} covariance is {was}; the configured default is used")
             self._covs[key] = (raw, verdict)
         if isinstance(verdict, str):
             return verdict

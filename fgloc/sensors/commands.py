@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fgloc.config import Config
+from fgloc.config import Config, GateConfig
 from fgloc.sensors.base import BuiltIn, EventInput, Stream, When
-from fgloc.sensors.checks import FieldChecks, Table, spikes
+from fgloc.sensors.checks import Table, spikes
 from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
@@ -43,18 +43,13 @@ def told(event: ControlEvent, drive: Drive | None) -> ControlEvent:
     return event if twist is None else replace(event, v=twist[0], vy=twist[1], omega=twist[2], steering=None)
 
 
-def validator(checks: FieldChecks) -> Callable[[ControlEvent], Event | str]:
-    """Validator of commands: finite, and within the gate's bounds."""
-    bounds = checks.config
-
-    def validate(event: ControlEvent) -> Event | str:
-        if not math.isfinite(event.v + event.omega + (event.steering or 0.0)):
-            return "non_finite"
-        if abs(event.v) > bounds.max_speed:
-            return "speed_bound"
-        return "yaw_rate_bound" if abs(event.omega) > bounds.max_yaw_rate else event
-
-    return validate
+def check(event: ControlEvent, gate: GateConfig) -> Event | str:
+    """The event, or why it cannot be used: it has to be finite, and within the gate's bounds."""
+    if not math.isfinite(event.v + event.omega + (event.steering or 0.0)):
+        return "non_finite"
+    if abs(event.v) > gate.max_speed:
+        return "speed_bound"
+    return "yaw_rate_bound" if abs(event.omega) > gate.max_yaw_rate else event
 
 
 class CommandChecks:
@@ -101,7 +96,7 @@ COMMANDS = BuiltIn(
                 "ackermann_msgs/msg/AckermannDriveStamped": lambda m, when: from_ackermann(m.drive, when),
             },
             ("cmd_vel", "ackermann_cmd", "drive"),
-            validator=validator,
+            check=check,
             findings=CommandChecks,
         ),
     ),

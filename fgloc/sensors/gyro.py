@@ -186,6 +186,7 @@ class Gyro:
     The bias is learned while the wheels stand, and between fixes of the yaw.
 
     Attributes:
+        up: ``(3,)`` the base's z axis in the IMU's frame, times the scale of its rates.
         bias: [rad/s].
         bias_variance: [rad²/s²].
         rejections: steps without a turn, by reason: ``gyro.silence``.
@@ -202,18 +203,13 @@ class Gyro:
         self.bias_variance = config.bias_sigma**2
         self.rejections: Counter[str] = Counter()
         self._config = config
-        self._up = np.asarray(up, dtype=float)
+        self.up = np.asarray(up, dtype=float)
         self._standing_s = 0.0
         self._wheels = Standing()
         self._anchor: tuple[float, float] | None = None  # yaw and variance of the last fix ...
         self._turned = self._turned_s = 0.0  # ... and what was turned since
         self._received = False
         self.forget_fix()
-
-    @property
-    def up(self) -> FloatArray:
-        """The base's z axis ``(3,)`` in the IMU's frame, times the scale of its rates."""
-        return self._up
 
     @property
     def at_rest(self) -> bool:
@@ -261,7 +257,7 @@ class Gyro:
     def rates_at(self, events: tuple[InertialEvent, ...], stamps_ns: tuple[int, ...]) -> FloatArray:
         """Yaw rates ``(n,)`` [rad/s] at these times, interpolated between the neighboring messages, bias removed."""
         times = np.array([(event.stamp_ns - stamps_ns[0]) * 1e-9 for event in events])
-        rates = np.array([event.angular_velocity for event in events]) @ self._up
+        rates = np.array([event.angular_velocity for event in events]) @ self.up
         at = np.array([(stamp - stamps_ns[0]) * 1e-9 for stamp in stamps_ns])
         return np.asarray(np.interp(at, times, rates) - self.bias)
 
@@ -316,7 +312,7 @@ class Gyro:
         if not events:
             return None
         times = np.array([(event.stamp_ns - start_ns) * 1e-9 for event in events])
-        rates = np.array([event.angular_velocity for event in events]) @ self._up
+        rates = np.array([event.angular_velocity for event in events]) @ self.up
         nodes = _nodes(times, (end_ns - start_ns) * 1e-9)
         return None if nodes is None else float(np.trapezoid(np.interp(nodes, times, rates), nodes))
 

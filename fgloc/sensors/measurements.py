@@ -70,7 +70,15 @@ class Measured:
     __slots__ = ()
 
     is_point: ClassVar[bool] = False
+    gives_pose: ClassVar[bool] = False
     in_pixels: ClassVar[bool] = False
+    errors_repeat: ClassVar[bool] = False
+    variable_dof: ClassVar[int] = 0
+
+    @property
+    def unnamed(self) -> bool:
+        """Whether the sensor does not say of which landmark it is."""
+        return False
 
     def exposed(self, twist: FloatArray, offset_s: float, jitter_s: float) -> Self:
         """Copy with the motion at the exposure, by which the residual depends on the clock; itself: it is as given.
@@ -148,11 +156,6 @@ class _OfLandmark(Measured):
     landmark_id: int
 
     @property
-    def unnamed(self) -> bool:
-        """Whether the sensor does not say of which landmark it is."""
-        return False
-
-    @property
     def row_id(self) -> int:
         """Id of the landmark."""
         return self.landmark_id
@@ -207,8 +210,6 @@ class PixelMeasurement(_OfLandmark):
     cov: ClassVar[None] = None
     gives_pose: ClassVar[bool] = True
     in_pixels: ClassVar[bool] = True
-    errors_repeat: ClassVar[bool] = False
-    variable_dof: ClassVar[int] = 0
     dof: ClassVar[int] = 8
 
     stamp_ns: int
@@ -307,7 +308,6 @@ class PointMeasurement(_InPlane):
 
     row_kind: ClassVar[str] = "range_bearing"
     is_point: ClassVar[bool] = True
-    gives_pose: ClassVar[bool] = False
     variable_dof: ClassVar[int] = 2
     dof: ClassVar[int] = 2
 
@@ -474,10 +474,6 @@ class PoseMeasurement(Measured, ABC):
 
     model: ClassVar[Model] = Model.POSE
     of_landmark: ClassVar[bool] = False
-    unnamed: ClassVar[bool] = False
-    gives_pose: ClassVar[bool] = False
-    errors_repeat: ClassVar[bool] = False
-    variable_dof: ClassVar[int] = 0
 
     source: str  # in steps.csv and in the counts
     stamp_ns: int

@@ -47,7 +47,7 @@ from fgloc.sensors.base import (
     UnusableMessageError,
     When,
 )
-from fgloc.sensors.checks import Table, count
+from fgloc.sensors.checks import Table, count, listed
 from fgloc.sensors.failures import EventFailure, Scene
 from fgloc.sensors.measurements import PoseMeasurement
 from fgloc.types import Event, FloatArray, Landmark, SensorEvent
@@ -286,14 +286,7 @@ def noise_m(events: Sequence[UwbEvent]) -> float | None:
 
 # --- For `fgloc info` -------------------------------------------------------------------------------------------------
 
-_MOST_SHOWN = 12  # anchors that are named
 _MOST_NUMBERS = 1000  # that are kept: damaged messages have any
-
-
-def numbers(some: Iterable[int]) -> str:
-    """The first of some anchors, for a sentence."""
-    ordered = sorted(some)
-    return ", ".join(map(str, ordered[:_MOST_SHOWN])) + (", ..." if len(ordered) > _MOST_SHOWN else "")
 
 
 class UwbChecks:
@@ -317,10 +310,10 @@ class UwbChecks:
         unknown = self._heard - section.anchors.keys()
         if section.anchors and unknown != self._heard and unknown:
             silent = section.anchors.keys() - self._heard
-            more = f", of which {numbers(silent)} are not heard on this topic" if silent else ""
+            more = f", of which {listed(silent)} are not heard on this topic" if silent else ""
             found.append(
-                f"{topic}: ranges to anchors {numbers(unknown)} are not used, as uwb.anchors has "
-                f"{numbers(section.anchors)}{more}: give their places."
+                f"{topic}: ranges to anchors {listed(unknown)} are not used, as uwb.anchors has "
+                f"{listed(section.anchors)}{more}: give their places."
             )
         ranges = self._ranges.array()[:, 0] * section.unit_m
         if (bad := ~np.isfinite(ranges)).any():

@@ -209,7 +209,7 @@ def test_fault_19_clocks_of_wheels_and_gyro(looked, kind, role):
 
 def test_the_motion_of_wheels_and_gyro_fits_poses_on_a_circle_only_if_they_are_those():
     step, times = np.array([0.02, 0.0, 0.03]), np.array([0.5, 1.5, 3.0, 3.6])
-    stretch = Stretch(times, (), np.tile(step, (200, 1)), np.full(200, 0.03), START_NS)
+    stretch = Stretch(times, (), np.tile(step, (200, 1)), np.full(200, 0.03))
     motion, extras = Motion([stretch], np.eye(3), Config()), np.zeros(len(EXTRAS))
     poses = np.array([se2.exp(step * t / GRID_S) for t in times])
     np.testing.assert_allclose(se2.between_array(poses, motion.path(0, extras)), 0.0, atol=1e-4)
@@ -223,7 +223,7 @@ def test_the_motion_of_wheels_and_gyro_fits_poses_on_a_circle_only_if_they_are_t
     [("yaw_per_m", 0.1, (1.0, 0.0, 0.1)), ("radius", 0.1, (math.exp(0.1), 0.0, 0.0)), ("track", 0.1, (1.0, 0.0, 0.0))],
 )
 def test_what_wheels_may_be_off_by_changes_their_motion(name, value, expected):
-    stretch = Stretch(np.array([0.5, 1.5]), (), np.tile([0.02, 0.0, 0.0], (100, 1)), None, START_NS)
+    stretch = Stretch(np.array([0.5, 1.5]), (), np.tile([0.02, 0.0, 0.0], (100, 1)), None)
     extras = np.where(np.array(EXTRAS) == name, value, 0.0)
     went, _, _ = Motion([stretch], np.eye(3), Config()).between(extras)
     np.testing.assert_allclose(went[0], se2.exp(np.array(expected)), atol=1e-3)
@@ -248,7 +248,7 @@ def test_a_rotation_matrix_that_is_rounded_has_an_angle():
 def test_wheels_without_noise_are_not_exact():
     noise = dict.fromkeys(Config().wheels.noise.model_dump(), 0.0)
     config = Config.model_validate({"wheels": {"noise": noise}})
-    stretch = Stretch(np.array([0.5, 1.5]), (), np.tile([0.02, 0.0, 0.03], (100, 1)), None, START_NS)
+    stretch = Stretch(np.array([0.5, 1.5]), (), np.tile([0.02, 0.0, 0.03], (100, 1)), None)
     _, sigmas, _ = Motion([stretch], np.eye(3), config).between(np.zeros(len(EXTRAS)))
     assert (sigmas > 0.0).all()
 

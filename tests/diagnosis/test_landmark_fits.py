@@ -14,7 +14,6 @@ from fgloc.diagnosis.landmark_fits import Mounting, compared, fit_on_map, fit_si
 from fgloc.diagnosis.landmarks import check_first_pose
 from fgloc.diagnosis.pairs import Figure
 from fgloc.diagnosis.signals import Path, SightingCollector, Sightings, Signals
-from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.range_bearing import RangeBearing, RangeBearingEvent
 from fgloc.types import Landmark, LandmarkMap
 
@@ -103,7 +102,7 @@ def test_a_sensor_without_noise_still_has_what_wheels_err_by(distance, least):
     sharp = {"range_sigma_m": 1e-3, "bearing_sigma_rad": 1e-4, "range_scale_sigma": 0.0}
     config = config_of({"landmarks": sharp | {"bearing_bias_sigma_rad": 0.0}})
     known = LandmarkMap({1: Landmark(1, np.array([1.0, 0.0, 0.0]), np.eye(3), 0.0)})
-    collector = SightingCollector(config, known, LandmarkSensor(config, known, None, None), np.eye(4))
+    collector = SightingCollector(config, known, (), None, np.eye(4))
     event = RangeBearingEvent(1, 1, "/landmarks", "base_link", (RangeBearing(1, distance, 0.3),))
     (seen,) = collector.sightings(event)
     assert np.linalg.norm(seen.point) == pytest.approx(distance)

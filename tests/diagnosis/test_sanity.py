@@ -209,7 +209,7 @@ def watched(poses, given, motions, seen=None, mapped=True):
 def test_a_watch_leaves_sound_estimates_as_they_are():
     poses, motions, _ = driven()
     watch, out = watched(poses, poses, motions, mapped=False)
-    assert watch.sentence is None
+    assert not watch.findings()
     assert all(np.array_equal(e.pose, p) for e, p in zip(out, poses, strict=True))
 
 
@@ -283,7 +283,7 @@ def test_a_watch_leaves_an_estimate_that_explains_few_sightings_where_the_odomet
     right, wrong = seen_from(poses), seen_from(poses, off=(2.0, 0.0))
     mixed = [right[k] if k < 330 or k % 5 in (0, 2) else wrong[k] for k in range(len(poses))]
     watch, out = watched(poses, poses, motions, mixed)
-    assert watch.sentence is None
+    assert not watch.findings()
     assert all(e.protection.position_m < 1.0 for e in out)
 
 

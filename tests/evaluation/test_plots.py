@@ -33,7 +33,7 @@ def all_modes(n=300):
 
 
 def pixels(figure):
-    return matplotlib.image.imread(io.BytesIO(style.png(figure)))
+    return matplotlib.image.imread(io.BytesIO(style.image_of(figure)))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fgloc import se2
-from fgloc.config import NoiseDensity
 from fgloc.errors import CovarianceError, ModelError
 from fgloc.sensors.base import Signal
 from fgloc.sensors.learned.card import Kinematics, ModelCard, Signals
@@ -368,16 +367,12 @@ class MotionModel(ABC):
         if end_ns <= start_ns:
             raise ModelError(f"the step ends at {end_ns} ns, not after its start {start_ns} ns")
         self._track = CommandHistory(commands) if self._track is None else self._track.following(commands)
-        return self._predict(self._track, start_ns, (end_ns - start_ns) * 1e-9, velocity, signals)
+        duration = (end_ns - start_ns) * 1e-9
+        return self._predict(self._track, start_ns, duration, velocity, signals or Signals(start_ns))
 
     @abstractmethod
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         """Motion over a duration [s], by the track of the commands; the rest as `predict` has it."""
 
@@ -436,23 +431,13 @@ def sub_steps(duration: float, longest_s: float) -> int:
 class NaiveModel(MotionModel):
     """The robot moves as commanded: v = u, in the model's kinematics. The baseline."""
 
-    def __init__(self, card: ModelCard) -> None:
-        """Take a checked card."""
-        super().__init__(card)
-        self._noise = _noise(card)
-
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         n = sub_steps(duration, self.card.dt_s)
         limits = (start_ns - track.origin_ns) * 1e-9 + duration / n * np.arange(n + 1, dtype=np.float64)
         twists = calibrated(self.card.kinematics, track, limits)
-        return _prediction(twists, self._noise, duration / n, twists[-1, ::2])
+        return _prediction(twists, self.card, duration / n, twists[-1, ::2])
 
 
 class VelocityModel(MotionModel):
@@ -468,19 +453,13 @@ class VelocityModel(MotionModel):
         """Take a checked card and its network; None for a ``lag`` model."""
         super().__init__(card)
         self._network = network
-        self._noise = _noise(card)
         self._lag = None if card.lag is None else np.array(card.lag.lag_s)
         self._delay = card.kinematics.delay_s if card.lag is None else card.lag.delay_s
         self._scale = np.array(card.output_scale)
         self._gains = gains(card.kinematics)
 
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         start = (start_ns - track.origin_ns) * 1e-9
         if velocity is None:
@@ -492,7 +471,7 @@ class VelocityModel(MotionModel):
         middles = 0.5 * (states[:-1] + states[1:])
         twists = np.zeros((len(middles), 3))
         twists[:, ::2] = middles
-        return _prediction(twists, self._noise, dt, states[-1])
+        return _prediction(twists, self.card, dt, states[-1])
 
     def _roll(self, track: CommandHistory, start: float, duration: float, velocity: FloatArray) -> FloatArray:
         """Velocities ``(n + 1, 2)`` at the limits of the n sub-steps."""
@@ -515,15 +494,10 @@ class VelocityModel(MotionModel):
         return states
 
 
-def _noise(card: ModelCard) -> NoiseDensity:
-    if card.noise is None:
-        raise ModelError(f"a {card.kind} model's card needs noise densities")
-    return card.noise
-
-
-def _prediction(twists: FloatArray, noise: NoiseDensity, dt: float, velocity: FloatArray) -> MotionPrediction:
-    """Motion of body twists ``(n, 3)``, each held for ``dt`` [s], with covariance."""
-    variances = np.array([noise.per_second(v, omega) for v, omega in twists[:, ::2].tolist()])
+def _prediction(twists: FloatArray, card: ModelCard, dt: float, velocity: FloatArray) -> MotionPrediction:
+    """Motion of body twists ``(n, 3)``, each held for ``dt`` [s], with covariance by the card's densities."""
+    assert card.noise is not None  # the card was checked
+    variances = np.array([card.noise.per_second(v, omega) for v, omega in twists[:, ::2].tolist()])
     return MotionPrediction(*composed((twists * dt).tolist(), (variances * dt).tolist()), velocity)
 
 
@@ -560,12 +534,7 @@ class DisplacementModel(MotionModel):
         self._plans: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = {}  # by number of sub-steps
 
     def _predict(
-        self,
-        track: CommandHistory,
-        start_ns: int,
-        duration: float,
-        velocity: FloatArray | None,
-        signals: Signals | None,
+        self, track: CommandHistory, start_ns: int, duration: float, velocity: FloatArray | None, signals: Signals
     ) -> MotionPrediction | None:
         n = sub_steps(duration, self.card.dt_s)
         dt = duration / n
@@ -612,22 +581,20 @@ class DisplacementModel(MotionModel):
             x[:, self._n_bins : self._n_told] = means[n:, 2].reshape(n, -1)
         return means[:n] @ self._gains, x
 
-    def _measured(self, base: FloatArray, x: Float32Array, signals: Signals | None, start_ns: int, dt: float) -> None:
+    def _measured(self, base: FloatArray, x: Float32Array, signals: Signals, start_ns: int, dt: float) -> None:
         """Fill the network's inputs from signals, and replace the twists that signals measure better than commands."""
         n, at = len(base), self._n_told
-        start = 0.0 if signals is None else (start_ns - signals.origin_ns) * 1e-9
-        starts = start + dt * np.arange(n, dtype=np.float64)
+        starts = (start_ns - signals.origin_ns) * 1e-9 + dt * np.arange(n, dtype=np.float64)
         for name in self.card.measured:
-            signal = None if signals is None else signals.named(name)
+            signal = signals.named(name)
             if signal is None:
                 raise ModelError(f"the model reads {name}, which the step has not; its inputs are {self.card.inputs}")
             features = signal_features(signal, starts, dt, self._signal_edges)
             x[:, at : at + features.shape[1]] = features
             at += features.shape[1]
-        if signals is not None:
-            base /= dt
-            measured_twists(base, self.card.wheel_kinematics, signals, starts, dt)
-            base *= dt
+        base /= dt
+        measured_twists(base, self.card.wheel_kinematics, signals, starts, dt)
+        base *= dt
 
     def _plan(self, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Linear maps by which one look-up in a track of commands serves n sub-steps.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from fgloc.config import GateConfig
 from fgloc.errors import CameraError, ConfigError, RecordingError
 from fgloc.sensors.base import (
     SENSOR,
@@ -58,20 +59,18 @@ def from_compressed_image(m: Any, when: When) -> Event:
 
 def from_apriltags(m: Any, when: When) -> Event:
     """Event of a ``apriltag_msgs/AprilTagDetectionArray``."""
-    sightings = []
-    for tag in m.detections:
-        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_OPENCV_ORDER)] + _OPENCV_SHIFT_PX
-        sightings.append(MarkerCorners(int(tag.id), corners))
-    return CornersEvent(*when, m.header.frame_id, tuple(sightings))
+    return CornersEvent(*when, m.header.frame_id, _tags(m.detections, _OPENCV_ORDER, _OPENCV_SHIFT_PX))
 
 
 def from_tagslam(m: Any, when: When) -> Event:
     """Event of a ``apriltag_msgs/ApriltagArrayStamped``, as TagSLAM's detector nodes publish it."""
-    sightings = []
-    for tag in m.apriltags:
-        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_TAGSLAM_ORDER)]
-        sightings.append(MarkerCorners(int(tag.id), corners))
-    return CornersEvent(*when, m.header.frame_id, tuple(sightings))
+    return CornersEvent(*when, m.header.frame_id, _tags(m.apriltags, _TAGSLAM_ORDER, 0.0))
+
+
+def _tags(tags: Any, order: Sequence[int], shift_px: float) -> tuple[MarkerCorners, ...]:
+    """Corners of tags, taken in this order and moved by this much to OpenCV's pixels."""
+    corners = (np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(order)] + shift_px for tag in tags)
+    return tuple(MarkerCorners(int(tag.id), own) for tag, own in zip(tags, corners, strict=True))
 
 
 def from_fiducials(m: Any, when: When) -> Event:
@@ -91,16 +90,12 @@ def from_fiducials(m: Any, when: When) -> Event:
 _MAX_PIXEL = 1e5
 
 
-def image_validator(checks: FieldChecks) -> Callable[[ImageEvent], Event | str]:
-    """Validator of images."""
-
-    def validate(event: ImageEvent) -> Event | str:
-        size = len(event.data)
-        if size == 0 or (not event.compressed and (event.width <= 0 or event.height <= 0)):
-            return "empty"
-        return "truncated" if not event.compressed and size < event.height * event.step else event
-
-    return validate
+def check_image(event: ImageEvent, gate: GateConfig) -> Event | str:
+    """The image, or why it cannot be used."""
+    size = len(event.data)
+    if size == 0 or (not event.compressed and (event.width <= 0 or event.height <= 0)):
+        return "empty"
+    return "truncated" if not event.compressed and size < event.height * event.step else event
 
 
 def corners_validator(checks: FieldChecks) -> Callable[[CornersEvent], Event | str]:
@@ -353,7 +348,7 @@ MARKERS = BuiltIn(
             ImageEvent,
             {"sensor_msgs/msg/Image": from_image, "sensor_msgs/msg/CompressedImage": from_compressed_image},
             ("image_raw", "image_raw/compressed", "image", "image/compressed"),
-            validator=image_validator,
+            check=check_image,
             findings=RawChecks,
         ),
         Stream(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -80,6 +80,12 @@ class JointsEvent(MotionEvent):
     def publisher(self) -> tuple[str, ...]:
         """Wheels and arm may share the topic: the joints tell them apart."""
         return self.names
+
+    def of(self, joints: Sequence[str], what: Literal["position", "velocity", "effort"]) -> list[float]:
+        """Values of some joints; NaN where the message does not hold the joint, or nothing of this kind."""
+        values: list[float] = getattr(self, what).tolist()
+        at = [self.names.index(name) if name in self.names else -1 for name in joints]
+        return [values[i] if i >= 0 and len(values) == len(self.names) else math.nan for i in at]
 
 
 NOT_GIVEN = np.full((6, 6), np.nan)

@@ -206,6 +206,10 @@ class WheelMotion:
     Sources: with "auto" wheel angles if the geometry is given, else the odometry (see `OdometryTrack`), else commands:
     the best that has messages.
 
+    Attributes:
+        source: where the motion comes from: "ticks", "odometry" or "command"; empty before any message came.
+        unknown_s: time [s] for which no motion of the wheels was known so far.
+
     ``rejections`` counts wheels.silence, wheels.pose_reset (an odometry that jumped) and wheels.encoder_reset.
     """
 
@@ -216,10 +220,10 @@ class WheelMotion:
             ConfigError: wheel angles are asked for without the wheels' geometry.
         """
         self._config = config
-        self._chosen = ""
-        self._unknown_steps = 0
+        self.source = ""
+        self.unknown_steps = 0
         self._delay_ns = int(config.delay_s * 1e9)
-        self._unknown_s = 0.0
+        self.unknown_s = 0.0
         self._segment: int | None = None
         if config.source == "auto" and config.drive is not None:
             kinds = ["ticks"]
@@ -237,24 +241,19 @@ class WheelMotion:
         self._taken: WeakKeyDictionary[Step, MotionMeasurement | None] = WeakKeyDictionary()
 
     @property
-    def source(self) -> str:
-        """Where the motion comes from: "ticks", "odometry" or "command"; empty before any message came."""
-        return self._chosen
-
-    @property
     def by_twist(self) -> bool:
         """Whether the motion is the twist of an odometry, not the change of its pose."""
-        return any(isinstance(t, OdometryTrack) and t.by_twist and t.kind == self._chosen for t in self._all)
+        return any(isinstance(t, OdometryTrack) and t.by_twist and t.kind == self.source for t in self._all)
 
     @property
     def from_commands(self) -> bool:
         """Whether there is no wheel odometry, and commands replace it."""
-        return self._chosen == "command"
+        return self.source == "command"
 
     @property
     def rejections(self) -> Counter[str]:
         """Number of readings and steps that could not be used so far, by reason."""
-        counts = Counter({"wheels.silence": self._unknown_steps} if self._unknown_steps else {})
+        counts = Counter({"wheels.silence": self.unknown_steps} if self.unknown_steps else {})
         for track in self._all:
             counts.update(track.rejections)
         return counts
@@ -263,19 +262,14 @@ class WheelMotion:
     def notes(self) -> tuple[str, ...]:
         """Notes for the user so far, one sentence each."""
         of_tracks = [note for track in self._all for note in track.notes.values()]
-        explained = any(track.kind == self._chosen and "source" in track.notes for track in self._all)
-        notes = [f"wheel motion comes from {_NAMES[self._chosen]}"] if self._chosen and not explained else []
+        explained = any(track.kind == self.source and "source" in track.notes for track in self._all)
+        notes = [f"wheel motion comes from {_NAMES[self.source]}"] if self.source and not explained else []
         notes += of_tracks
-        if self._unknown_s >= _SHORTEST_TOLD_S:
-            short, s = self._unknown_s < 0.1, "" if self._unknown_steps == 1 else "s"
-            lasted = f"{1e3 * self._unknown_s:.0f} ms" if short else f"{self._unknown_s:.1f} s"
-            notes.append(f"no wheel motion was known for {lasted} in {self._unknown_steps} step{s}")
+        if self.unknown_s >= _SHORTEST_TOLD_S:
+            short, s = self.unknown_s < 0.1, "" if self.unknown_steps == 1 else "s"
+            lasted = f"{1e3 * self.unknown_s:.0f} ms" if short else f"{self.unknown_s:.1f} s"
+            notes.append(f"no wheel motion was known for {lasted} in {self.unknown_steps} step{s}")
         return tuple(notes)
-
-    @property
-    def unknown_s(self) -> float:
-        """Time [s] for which no motion of the wheels was known so far."""
-        return self._unknown_s
 
     @property
     def track_m(self) -> float | None:
@@ -301,8 +295,8 @@ class WheelMotion:
             start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns
             within = timeline.variance_within(start_ns, end_ns, bool(step.sightings or step.sensed))
             if unknown_s > 0.0:
-                self._unknown_steps += 1
-                self._unknown_s += unknown_s
+                self.unknown_steps += 1
+                self.unknown_s += unknown_s
             measured = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov, end_variance=within)
         self._taken[step] = measured
         return measured
@@ -367,7 +361,7 @@ class WheelMotion:
             change = end - se2.adjoint(se2.inverse(m.motion)) @ start  # by it a wrong clock shows
             by |= {"wheels.time_offset_s": change, "wheels.delay_s": -change}
         drive = config.drive
-        if drive is not None and self._chosen == "ticks":
+        if drive is not None and self.source == "ticks":
             names = tuple(drive.states)
             start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns
             D = self._active(step).sensitivity(start_ns, end_ns, len(names))
@@ -393,7 +387,7 @@ class WheelMotion:
             if start is not None and start < step.stamp_ns - self._delay_ns:
                 if track is not self._tracks[-1]:  # worse ones are not needed any more
                     self._tracks = self._tracks[: self._tracks.index(track) + 1]
-                self._chosen = track.kind
+                self.source = track.kind
                 return track.timeline
         return (active or self._tracks)[0].timeline
 

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -25,6 +26,7 @@ _STEERING = re.compile(r"steer", re.I)
 _DIAGONAL = 0.1  # share of four wheels' motion in which diagonal ones turn alike, against the others: rollers
 _SIDE = 0.02  # likewise that tells wheels of one side from one another: below it they turn alike
 _FEWEST = 50  # samples
+_NAMED_BY = 100  # messages whose joints are looked at: arm and wheels may take turns on a topic
 _ASIDE, _MOVES = 0.1, 0.05  # share of moving samples that go more sideways than ahead; m/s
 TICKS = "ticks_per_turn:  # positions are ticks: so many a turn of the wheel, or of the motor with radius over the gear"
 
@@ -42,6 +44,11 @@ class NamedDrive:
     kind: str
     why: str
     lines: tuple[str, ...]
+
+
+def joint_names(joints: Sequence[JointsEvent]) -> tuple[str, ...]:
+    """Names of the joints in the first messages, in their order."""
+    return tuple(dict.fromkeys(name for event in joints[:_NAMED_BY] for name in event.names))
 
 
 def goes_sideways(told: Sequence[Sequence[float]]) -> float | None:
@@ -75,7 +82,7 @@ def name_drive(
 
     Where positions are ticks, its lines have the ticks of a turn.
     """
-    names = tuple(dict.fromkeys(name for event in joints[:100] for name in event.names))
+    names = joint_names(joints)
     steering = [name for name in names if _STEERING.search(name)]
     wheels = [name for name in names if name not in steering and not re.search("arm|gripper|head", name, re.I)]
     wheels = [name for name in wheels if "wheel" in name.lower()] or wheels
@@ -107,7 +114,8 @@ def _named(
         return NamedDrive("tricycle", why, keys)
     if steering and wheels:
         rear = [name for name in wheels if not _FRONT.search(_words(name))] or wheels
-        keys = (_list("wheels", rear), _list("steering_joints", _by_side(steering)), "radius:  # m", "wheelbase:  # m")
+        by_side = sorted(steering, key=lambda name: bool(_RIGHT.search(_words(name))))
+        keys = (_list("wheels", rear), _list("steering_joints", by_side), "radius:  # m", "wheelbase:  # m")
         return NamedDrive("ackermann", f"steered by {' and '.join(steering)}", keys)
     placed = [
         [name for name in wheels if end.search(_words(name)) and side.search(_words(name))]
@@ -126,10 +134,6 @@ def _words(name: str) -> str:
 
 def _list(key: str, names: Sequence[str]) -> str:
     return f"{key}: [{', '.join(names)}]"
-
-
-def _by_side(names: Sequence[str]) -> list[str]:
-    return sorted(names, key=lambda name: bool(_RIGHT.search(_words(name))))
 
 
 def _four(joints: Sequence[JointsEvent], corner: Sequence[str]) -> NamedDrive | None:
@@ -154,14 +158,9 @@ def _four(joints: Sequence[JointsEvent], corner: Sequence[str]) -> NamedDrive | 
     return None
 
 
-def _values(joints: Sequence[JointsEvent], names: Sequence[str], what: str) -> FloatArray:
+def _values(joints: Sequence[JointsEvent], names: Sequence[str], what: Literal["position", "velocity"]) -> FloatArray:
     """Rows ``(n, joints)`` of what these joints report, where all of them do."""
-    rows = [
-        getattr(event, what)[[event.names.index(name) for name in names]]
-        for event in joints
-        if set(names) <= set(event.names) and len(getattr(event, what)) == len(event.names)
-    ]
-    table = np.array(rows, dtype=float).reshape(-1, len(names))
+    table = np.array([event.of(names, what) for event in joints], dtype=float).reshape(-1, len(names))
     return np.asarray(table[np.isfinite(table).all(axis=1)])
 
 

@@ -43,7 +43,7 @@ from fgloc.sensors.wheels.events import (
     odometry_validator,
 )
 from fgloc.sensors.wheels.motion import INSTALLATION
-from fgloc.sensors.wheels.naming import TICKS, NamedDrive, count_ticks, name_drive
+from fgloc.sensors.wheels.naming import TICKS, NamedDrive, count_ticks, joint_names, name_drive
 from fgloc.sensors.wheels.tracks import wheel_names
 from fgloc.types import ControlEvent, Event, FloatArray
 
@@ -102,7 +102,6 @@ _FEWEST = 50  # messages of each, for a fit
 _FITS = 0.98  # share of the odometry's variance that the wheels must explain
 _CAUCHY, _ITERATIONS = 3.5, 5  # median absolute deviations beyond which a residual counts less: 95 % efficiency
 _LEAST_TURNING = 0.05  # rad/s: standard deviation of the yaw rate below which the track does not show
-NAMED_BY = 100  # messages whose joints are looked at: arm and wheels may take turns on a topic
 _WINDOW_S = 0.3  # over which rates are means: stamps of single messages jitter
 _STEADY_S = 1.0  # after a command: by then the wheels turn as they are told
 _ASKEW = 0.01  # rad: a pose whose heading is off its way by more has the heading from elsewhere
@@ -135,11 +134,6 @@ class WheelGeometry:
     by_commands: bool = False
 
 
-def joint_names(joints: Sequence[JointsEvent]) -> tuple[str, ...]:
-    """Names of the joints in the first messages, in their order."""
-    return tuple(dict.fromkeys(name for event in joints[:NAMED_BY] for name in event.names))
-
-
 def wheel_pair(names: Sequence[str]) -> WheelPair | None:
     """The joints that are the left and right wheel by their names; None if that is not clear."""
     words = {name: name.replace("_", " ").replace("-", " ") for name in names}
@@ -165,7 +159,7 @@ def fit_geometry(
         odometry: of the same drive, likewise.
         commands: likewise.
     """
-    angles = np.array([_angles(event, pair) for event in joints])
+    angles = np.array([event.of((pair.left, pair.right), "position") for event in joints])
     stamps = np.array([event.stamp_ns for event in joints], dtype=np.int64)
     keep = np.flatnonzero(np.diff(stamps, prepend=-1) > 0)
     if len(keep) < _FEWEST or len(odometry) < _FEWEST or not np.isfinite(angles[keep]).all():
@@ -263,14 +257,6 @@ def settings_of(events: Sequence[Event]) -> dict[str, Any] | None:
         "right_radius": right,
         "track": float(f"{found.track_m:.4g}"),
     }
-
-
-def _angles(event: JointsEvent, pair: WheelPair) -> tuple[float, float]:
-    def of(name: str) -> float:
-        i = event.names.index(name) if name in event.names else -1
-        return float(event.position[i]) if 0 <= i < len(event.position) else float("nan")
-
-    return of(pair.left), of(pair.right)
 
 
 def _slope(x: FloatArray, y: FloatArray) -> float | None:
@@ -377,60 +363,45 @@ def _to_fill_in(pair: WheelPair | None) -> tuple[str, ...]:
 FIRST_SETTINGS = FirstSettings((JointsEvent, OdometryEvent, ControlEvent), _first_section)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SetupMistake:
-    """Mistake in the odometer's settings, as an excerpt of a recording shows it.
+def correct(kind: str, factor: float, turned: FloatArray, by_ticks: bool, wheels: WheelsConfig) -> RawMistake:
+    """Sentence for the user on a mistake in the odometer's settings, and the settings that correct it.
 
-    Attributes:
+    Args:
         kind: ``radius``, ``track``, ``odometry_frame``, or a key of `WRONG_SIDES`.
         factor: of radius and track: true over given.
         turned: of the others: what brings its twist ``(3,)`` into the base's axes, ``(3, 3)``.
-        source: of its motion, as `Odometer.source` has it.
+        by_ticks: whether its motion is that of the joints.
+        wheels: as given.
     """
-
-    kind: str
-    factor: float
-    turned: FloatArray
-    source: str
-
-
-def correct(mistake: SetupMistake, config: Config) -> RawMistake:
-    """Sentence for the user on a mistake, and the settings that correct it."""
-    wheels = config.wheels
-    match mistake.kind:
-        case "track":
-            return _track(mistake, wheels)
-        case "radius":
-            return _radius(mistake, wheels)
-        case "odometry_frame":
-            c, s = mistake.turned[:2, 0]
-            sentence = (
-                f"The odometry's twist is in axes turned by {-math.degrees(math.atan2(s, c)):.0f}° against the base: "
-                "set wheels.source: pose, or correct its child_frame_id."
-            )
-            return RawMistake("odometry.twist_frame", sentence, "wheels", {"source": "pose"})
-        case _:
-            return _sides(mistake, wheels)
-
-
-def _track(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    if mistake.source == "ticks" and wheels.track is not None:
-        new = {"track": wheels.track * mistake.factor}
-    else:
-        new = {"scale_omega": wheels.scale_omega / mistake.factor}
-    sentence = f"The wheels turn the robot {1.0 / mistake.factor:.3f} times as far as given: set {_lines(new)}."
-    return RawMistake("wheels.turn", sentence, "wheels", new)
-
-
-def _radius(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    factor = mistake.factor
-    if mistake.source == "ticks" and wheels.left_radius is not None and wheels.right_radius is not None:
-        new = {"left_radius": wheels.left_radius * factor, "right_radius": wheels.right_radius * factor}
-        sentence = f"The wheels' radii are {factor:.3f} times those given: set {_lines(new)}."
-    else:
-        new = {"scale_v": wheels.scale_v * factor, "scale_omega": wheels.scale_omega * factor}
-        sentence = f"The robot moves {factor:.3f} times as far as its odometry says: set {_lines(new)}."
-    return RawMistake("wheels.scale", sentence, "wheels", new)
+    new: dict[str, Any]
+    if kind == "track":
+        new = {"scale_omega": wheels.scale_omega / factor}
+        if by_ticks and wheels.track is not None:
+            new = {"track": wheels.track * factor}
+        sentence = f"The wheels turn the robot {1.0 / factor:.3f} times as far as given: set {_lines(new)}."
+        return RawMistake("wheels.turn", sentence, "wheels", new)
+    if kind == "radius":
+        by_radii = by_ticks and None not in (wheels.left_radius, wheels.right_radius)
+        keys = ("left_radius", "right_radius") if by_radii else ("scale_v", "scale_omega")
+        new = {key: getattr(wheels, key) * factor for key in keys}
+        sentence = (
+            f"The wheels' radii are {factor:.3f} times those given"
+            if by_radii
+            else f"The robot moves {factor:.3f} times as far as its odometry says"
+        )
+        return RawMistake("wheels.scale", f"{sentence}: set {_lines(new)}.", "wheels", new)
+    if kind == "odometry_frame":
+        c, s = turned[:2, 0]
+        sentence = (
+            f"The odometry's twist is in axes turned by {-math.degrees(math.atan2(s, c)):.0f}° against the base: "
+            "set wheels.source: pose, or correct its child_frame_id."
+        )
+        return RawMistake("odometry.twist_frame", sentence, "wheels", {"source": "pose"})
+    new = right_sides(kind, wheels) if by_ticks else {}
+    by_hand = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
+    line = f"set {_lines(new)}" if new else by_hand
+    code = "wheels.sign" if kind == "exchanged" else "wheels.reversed"
+    return RawMistake(code, f"The wheels {WRONG_SIDES[kind]}: {line}.", "wheels", new)
 
 
 WRONG_SIDES = {
@@ -464,15 +435,6 @@ def right_sides(kind: str, wheels: WheelsConfig) -> dict[str, Any]:
     if kind != "left_reversed":
         new["right_radius"] = -wheels.right_radius
     return new
-
-
-def _sides(mistake: SetupMistake, wheels: WheelsConfig) -> RawMistake:
-    """Sentence on wheels with sides exchanged or counts reversed, and the settings that correct it."""
-    new = right_sides(mistake.kind, wheels) if mistake.source == "ticks" else {}
-    by_hand = "exchange wheels.left_joint and wheels.right_joint, or correct the driver's signs"
-    line = f"set {_lines(new)}" if new else by_hand
-    code = "wheels.sign" if mistake.kind == "exchanged" else "wheels.reversed"
-    return RawMistake(code, f"The wheels {WRONG_SIDES[mistake.kind]}: {line}.", "wheels", new)
 
 
 def _lines(values: Mapping[str, Any]) -> str:
