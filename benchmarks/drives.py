@@ -108,7 +108,7 @@ import numpy as np
 import yaml
 from scipy.io import loadmat
 
-from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.common import DATA, Row, main, mean_row, not_run
 from benchmarks.field import distances, outcome
 from benchmarks.field_peers import hear
 from benchmarks.field_recordings import RECORDINGS, Recording, car_gnss, mecanum, plaza, tricycle
@@ -382,7 +382,7 @@ def plaza_unknown(drives: int) -> Iterator[Row]:
         errors_m = [_rms(_aligned(*_plaza_places(result, data["GT"]))) for result in of_run]
         drove.append([errors_m[0] / errors_m[1], *errors_m])
     for name, unit, values in zip(names, ("", "m", "m"), np.array(drove).T, strict=True):
-        yield Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+        yield mean_row(name, values, unit)
         yield Row(f"{name}.largest", float(np.max(values)), n=len(values), unit=unit)
 
 
@@ -706,7 +706,7 @@ def drive_rows(quick: bool, drives: Sequence[str] = DRIVES, seeds: Sequence[int]
 def _row(name: str, values: Sequence[float], unit: str, failed: str) -> Row:
     if failed or not values:
         return Row(name, None, n=0, reason=failed or "no run")
-    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+    return mean_row(name, values, unit)
 
 
 def _cell(drive: str, case: str, seed: int) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.common import Row, main, not_run
+from benchmarks.common import Row, main, mean_row, not_run, ratio_row
 from benchmarks.recordings import (
     SEEDS,
     Recorded,
@@ -188,7 +188,7 @@ def _mean(figure: _Figure, unit: str = "") -> Callable[[str, Sequence[Scores]], 
 
     def row(row_id: str, scores: Sequence[Scores]) -> Row:
         values, missing = _values(row_id, scores, figure)
-        return missing or Row(row_id, float(np.mean(values)), float(np.std(values)), len(values), unit)
+        return missing or mean_row(row_id, values, unit)
 
     return row
 
@@ -232,7 +232,7 @@ def best_over_fgloc(row_id: str, scores: Sequence[Scores]) -> Row:
     best = min(theirs.values(), key=lambda values: float(values.mean()))
     if not np.isfinite(best).all():
         return Row(row_id, None, n=len(scores), reason="no pipeline of the textbook found a pose in every run")
-    return Row(row_id, float(best.mean() / np.mean(ours)), float(np.std(best / ours)), len(scores))
+    return ratio_row(row_id, best, ours)
 
 
 def _values(row_id: str, scores: Sequence[Scores], figure: _Figure) -> tuple[list[float], Row | None]:
@@ -349,7 +349,7 @@ def maps(quick: bool, split: Split) -> Iterator[Row]:
         return
     for name, unit in _MAPS.items():
         values = [float(f[name]) for f in found]
-        yield Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+        yield mean_row(name, values, unit)
 
 
 def mapped(run_folder: Path) -> Mapping[str, float | str]:

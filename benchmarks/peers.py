@@ -16,7 +16,6 @@ those who run here.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import math
 import shutil
 import sys
@@ -27,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import Row, main
+from benchmarks.common import Row, main, mean_row, ratio_row
 from benchmarks.recordings import SEEDS, Recorded, Split, Take, changed, load, prepare
 from benchmarks.replays import Replayed, failures, floor, kept, processor_times, replayed
 from benchmarks.textbook import PIPELINES, Textbook
@@ -86,10 +85,10 @@ def _rows(case: str, runs: Sequence[Scores]) -> Iterator[Row]:
         times = [run[name].get("update_ms", math.nan) for run in runs]
         if np.isnan(times).any():  # ran elsewhere
             continue
-        yield Row(f"peers.{case}.{name}.update_ms", float(np.mean(times)), float(np.std(times)), len(times), "ms")
+        yield mean_row(f"peers.{case}.{name}.update_ms", times, "ms")
     best = min((name for name in means if name != "fgloc"), key=lambda name: means[name])
-    ratios = np.array([run[best]["ate_mm"] / run["fgloc"]["ate_mm"] for run in runs])
-    yield Row(f"peers.{case}.best_over_fgloc", means[best] / means["fgloc"], float(ratios.std()), len(runs), best)
+    theirs, ours = ([run[name]["ate_mm"] for run in runs] for name in (best, "fgloc"))
+    yield ratio_row(f"peers.{case}.best_over_fgloc", theirs, ours, best)
 
 
 # --- Runs -------------------------------------------------------------------------------------------------------------
@@ -97,14 +96,7 @@ def _rows(case: str, runs: Sequence[Scores]) -> Iterator[Row]:
 
 def _scored(case: str, split: Split, seed: int) -> Scores:
     """Scores of fgloc and all peers in one case, kept under the hash of fgloc's sources and of the peers'."""
-    return kept(f"peers_{case}_{split}_{seed}_{_sources()}", lambda: run_all(case, split, seed))
-
-
-@cache
-def _sources() -> str:
-    """Hash of the sources of this benchmark's peers."""
-    parts = [(_HERE / f"{name}.py").read_bytes() for name in ("peers", "textbook")]
-    return hashlib.sha256(b"".join(parts)).hexdigest()[:12]
+    return kept(f"peers_{case}_{split}_{seed}", lambda: run_all(case, split, seed), Path(__file__))
 
 
 def run_all(case: str, split: Split, seed: int) -> dict[str, dict[str, float]]:

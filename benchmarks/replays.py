@@ -233,9 +233,9 @@ def moved_id(recorded: Recorded) -> int:
 # --- Figures that are kept --------------------------------------------------------------------------------------------
 
 
-def kept(name: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Result of a cell: from the cache, or made now and put there."""
-    path = cache_folder() / "installed" / f"{name}_{_sources()}.json"
+def kept(name: str, make: Callable[[], Mapping[str, Any]], *sources: Path) -> Mapping[str, Any]:
+    """Result of a cell: from the cache, or made now and put there; ``sources``: others that it depends on."""
+    path = cache_folder() / "installed" / f"{name}_{_sources(sources)}.json"
     if path.is_file():
         return dict(json.loads(path.read_text(encoding="utf-8")))
     began = time.monotonic()
@@ -252,10 +252,10 @@ def kept(name: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 @cache
-def _sources() -> str:
+def _sources(others: tuple[Path, ...]) -> str:
     made = hashlib.sha256()
     package = sorted(p for p in (ROOT / "fgloc").rglob("*") if p.suffix in (".py", ".safetensors"))
-    for path in [*package, *(ROOT / "benchmarks" / f"{name}.py" for name in _SCORING)]:
+    for path in [*package, *(ROOT / "benchmarks" / f"{name}.py" for name in _SCORING), *others]:
         made.update(path.relative_to(ROOT).as_posix().encode())
         made.update(path.read_bytes())
     return made.hexdigest()[:12]
