@@ -123,7 +123,7 @@ def test_cells_are_made_once_and_anew_when_a_source_changes(tmp_path, monkeypatc
         return {"value": len(made)}
 
     assert replays.kept("cell", make) == replays.kept("cell", make) == {"value": 1}
-    monkeypatch.setattr(replays, "_sources", lambda: "other")
+    monkeypatch.setattr(replays, "_sources", lambda others: "other")
     assert replays.kept("cell", make) == {"value": 2}
 
 
