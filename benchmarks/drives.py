@@ -118,7 +118,7 @@ from benchmarks.recordings import SEEDS, Recorded, Take, cache_folder, changed, 
 from benchmarks.replays import failure, kept, replayed
 from benchmarks.scores import errors
 from fgloc import se2
-from fgloc.ablation.failures import corrupt, generators
+from fgloc.ablation.failures import Corruption
 from fgloc.calibrate import calibrate
 from fgloc.calibration.anchors import survey_anchors
 from fgloc.config import Config, config_of
@@ -128,7 +128,6 @@ from fgloc.files.atomic import atomic_folder
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import RunResult, run
-from fgloc.sensors.failures import Scene
 from fgloc.sensors.gnss import GnssEvent, east_north
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.odometry import BesideEvent
@@ -626,7 +625,7 @@ def with_odometry(seed: int, case: str | None) -> Scores:
     added = second_odometry(recorded, seed, told) if case is not None else []
     kept = [e for e in recorded.events if not isinstance(e, OdometryEvent)]
     events: Sequence[Event] = sorted([*kept, *added], key=lambda e: e.received_ns)
-    scenes = [Scene(recorded.start_ns, recorded.duration_s, config, (), rng) for rng in generators(len(chain), seed)]
+    failing = Corruption(chain, (recorded.start_ns, recorded.duration_s), config, seed=seed)
     named: list[tuple[float, bool]] = []  # when a step was judged, and whether it left the source out
 
     def note(step: Step, estimate: Estimate | None) -> None:
@@ -640,7 +639,7 @@ def with_odometry(seed: int, case: str | None) -> Scores:
         config,
         "online",
         on_step=note,
-        events=lambda _: corrupt(chain, "recorded", iter(events), scenes),
+        events=lambda _: failing.recorded(iter(events)),
     )
     metrics = compute_metrics(result, config)
     begun = recorded.truth[recorded.truth[:, 0] >= _FAILED_S[0]]

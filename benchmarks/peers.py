@@ -31,13 +31,12 @@ from benchmarks.recordings import SEEDS, Recorded, Split, Take, changed, load, p
 from benchmarks.replays import Replayed, failures, floor, kept, processor_times, replayed
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc import se2
-from fgloc.ablation.failures import corrupt, generators
+from fgloc.ablation.failures import Corruption
 from fgloc.config import WheelsConfig
 from fgloc.evaluation.metrics import match, nees
 from fgloc.files.outputs import read_tum
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.reader import Recording
-from fgloc.sensors.failures import Scene
 from fgloc.sensors.gyro import ImuEvent
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
@@ -210,14 +209,10 @@ def export(out: Path, quick: bool, split: Split, seeds: int | None) -> None:
 
 def _export(recorded: Recorded, case: str, seed: int, out: Path) -> None:
     chain = failures(case, recorded)
-    ids = tuple(sorted(recorded.landmarks.landmarks))
-    scenes = [
-        Scene(recorded.start_ns, recorded.duration_s, recorded.config, ids, rng) for rng in generators(len(chain), seed)
-    ]
-    landmarks = recorded.landmarks
-    for made, scene in zip(chain, scenes, strict=True):
-        landmarks = made.corrupt_map(landmarks, scene)
-    events = corrupt(chain, "sightings", corrupt(chain, "recorded", iter(recorded.events), scenes), scenes)
+    span = recorded.start_ns, recorded.duration_s
+    failing = Corruption(chain, span, recorded.config, recorded.landmarks, seed)
+    landmarks = failing.corrupt_map(recorded.landmarks)
+    events = failing.sightings(failing.recorded(iter(recorded.events)))
     with BagWriter(out / "bag", overwrite=True) as bag, Recording(recorded.bag, recorded.config.recording) as source:
         for topic, kind, received_ns, raw in source.messages():
             if kind not in _REWRITTEN:

@@ -27,13 +27,13 @@ from pydantic import TypeAdapter
 
 from benchmarks.common import ROOT
 from benchmarks.recordings import Floor, Recorded, cache_folder, moved_interval
-from fgloc.ablation.failures import AnyFailure, Kidnap, Lift, corrupt, generators
+from fgloc.ablation.failures import AnyFailure, Corruption, Kidnap, Lift
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.estimation.localizer import Localizer
 from fgloc.files.atomic import atomic_file
 from fgloc.runner import RunResult, protections, run
-from fgloc.sensors.failures import Failure, Scene
+from fgloc.sensors.failures import Failure
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.range_bearing import RangeBearingEvent
@@ -140,8 +140,7 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
     Raises:
         FglocError: the configuration does not fit the recording.
     """
-    ids = tuple(sorted(recorded.landmarks.landmarks))
-    scenes = [Scene(recorded.start_ns, recorded.duration_s, config, ids, rng) for rng in generators(len(chain), seed)]
+    failing = Corruption(chain, (recorded.start_ns, recorded.duration_s), config, recorded.landmarks, seed)
     estimates: list[Estimate] = []
     steps: list[Step] = []
     given: list[Event] = []
@@ -158,9 +157,7 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
             yield event
 
     with tempfile.TemporaryDirectory() as folder:
-        map_path, landmarks = recorded.map_path, recorded.landmarks
-        for failure, scene in zip(chain, scenes, strict=True):
-            landmarks = failure.corrupt_map(landmarks, scene)
+        map_path, landmarks = recorded.map_path, failing.corrupt_map(recorded.landmarks)
         if landmarks is not recorded.landmarks:
             map_path = Path(folder) / "map.yaml"
             write_map(landmarks, map_path)
@@ -171,8 +168,8 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
                 config,
                 "batch" if batch else "online",
                 on_step=note,
-                events=lambda _: corrupt(chain, "recorded", iter(recorded.events), scenes),
-                sightings=lambda events: keep(corrupt(chain, "sightings", events, scenes)),
+                events=lambda _: failing.recorded(iter(recorded.events)),
+                sightings=lambda events: keep(failing.sightings(events)),
             )
         except EstimatorError:
             if estimates:
