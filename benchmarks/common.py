@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,6 +41,11 @@ def ratio_row(row_id: str, values: Iterable[float], over: Iterable[float], unit:
     """Mean of several runs over that of others; the spread is that of the single ratios."""
     first, second = (np.array(list(of_all), dtype=float) for of_all in (values, over))
     return Row(row_id, float(first.mean() / second.mean()), float(np.std(first / second)), len(first), unit)
+
+
+def stamp_of(header: Any) -> int:
+    """Stamp of a message's header [ns]."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def not_run(ids: Iterable[str], reason: str) -> list[Row]:

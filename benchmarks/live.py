@@ -503,7 +503,7 @@ def wrong_ids(events: Iterable[Event], ids: Iterable[int], rng: np.random.Genera
 
 
 def mirrored(landmark_map: LandmarkMap) -> LandmarkMap:
-    """The map as it is seen from below."""
+    """The map as it is seen from below: the sign of y changed, markers upright as before."""
     flip = np.diag([1.0, -1.0, 1.0])
     landmarks = {
         i: dataclasses.replace(m, position=flip @ m.position, rotation=flip @ m.rotation @ np.diag([-1.0, 1.0, 1.0]))
