@@ -767,7 +767,6 @@ def load_made(made: Scenario, seed: int, name: str) -> Recorded:
     config = config_of(robot_settings(made) | {"motion": {"use": False}})
     with open_recording(folder / "bag", config.recording) as recording:
         start_ns, duration_s, events = recording.span_ns[0], recording.duration_s, tuple(recording.events())
-    none = np.empty(0)
     return Recorded(
         name=folder.name,
         bag=folder / "bag",
@@ -776,9 +775,6 @@ def load_made(made: Scenario, seed: int, name: str) -> Recorded:
         landmarks=load_map(folder / "map.yaml"),
         events=events,
         start_ns=start_ns,
-        slip_s=none,
-        slipping=none.astype(bool),
-        slip=np.empty((0, 3)),
         truth=truth_of(events, start_ns),
         duration_s=duration_s,
     )
