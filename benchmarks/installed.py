@@ -26,12 +26,10 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +48,7 @@ from benchmarks.recordings import (
     load,
     prepare,
 )
-from benchmarks.replays import Replayed, failures, floor, kept, parallel, processor_times, replayed
+from benchmarks.replays import Replayed, by_recording, failures, floor, kept, processor_times, replayed
 from benchmarks.scores import (
     Scores,
     errors,
@@ -135,7 +133,7 @@ def measure(
     cells = {cell for w in todo for cell in w.cells(split, seeds)}
     try:
         prepare(cell.take for cell in cells)
-        found = run_all(sorted(cells), jobs) if cells else {}
+        found = by_recording(scores_of, sorted(cells), attrgetter("take"), jobs)
     except RenderError as error:
         yield from not_run([w.id for w in rows], str(error))
     else:
@@ -247,23 +245,6 @@ def _values(row_id: str, scores: Sequence[Scores], figure: _Figure) -> tuple[lis
 
 
 # --- Many cells -------------------------------------------------------------------------------------------------------
-
-
-def run_all(cells: Sequence[Cell], jobs: int) -> dict[Cell, Scores]:
-    """Scores of all cells, from the cache or run now; a process keeps to one recording."""
-    groups = [list(group) for _, group in groupby(sorted(cells), key=lambda cell: cell.take)]
-    found: dict[Cell, Scores] = {}
-    began = time.monotonic()
-    for done in parallel(_run_group, groups, jobs):
-        found.update(done)
-        gone = time.monotonic() - began
-        left = gone * (len(cells) / len(found) - 1.0)
-        print(f"{len(found)} of {len(cells)} cells, {gone:.0f} s, {left:.0f} s left", file=sys.stderr, flush=True)
-    return found
-
-
-def _run_group(cells: Sequence[Cell]) -> dict[Cell, Scores]:
-    return {cell: scores_of(cell) for cell in cells}
 
 
 def scores_of(cell: Cell) -> Scores:

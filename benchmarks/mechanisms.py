@@ -34,12 +34,10 @@ import argparse
 import hashlib
 import math
 import os
-import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
-from itertools import groupby
+from operator import attrgetter
 from typing import Any, Self
 
 import numpy as np
@@ -50,7 +48,7 @@ from benchmarks.installed import Cell as InstalledCell
 from benchmarks.installed import scores_of
 from benchmarks.mechanisms_off import BY_NAME, JOIN, MECHANISMS, Mechanism, together, watched
 from benchmarks.recordings import MRCLAM, SEEDS, Floor, Recorded, Split, Take, changed, folder, load, prepare, robot
-from benchmarks.replays import FAILURES, Replayed, failure, floor, kept, parallel, replayed
+from benchmarks.replays import FAILURES, Replayed, by_recording, failure, floor, kept, parallel, replayed
 from benchmarks.scores import Errors, Scores, errors, lost_share, named, slips
 from fgloc.ablation.failures import MovedMarker
 from fgloc.config import Config
@@ -251,17 +249,7 @@ def nees_between(result: RunResult, config: Config, span_ns: tuple[int, int]) ->
 def run_all(cells: Iterable[Cell], jobs: int) -> dict[Cell, Outcome]:
     """Outcomes of all cells, from the cache or run now; a process keeps to one recording at a time."""
     ordered = sorted(set(cells), key=lambda cell: (str(cell.source), cell.case, cell.off))
-    groups = [list(group) for _, group in groupby(ordered, key=lambda cell: cell.source)]
-    found: dict[Cell, Outcome] = {}
-    began = time.monotonic()
-    for done in parallel(_run_group, groups, jobs):
-        found.update(done)
-        print(f"{len(found)} of {len(ordered)} cells, {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
-    return found
-
-
-def _run_group(cells: Sequence[Cell]) -> dict[Cell, Outcome]:
-    return {cell: outcome(cell) for cell in cells}
+    return by_recording(outcome, ordered, attrgetter("source"), jobs)
 
 
 def outcome(cell: Cell) -> Outcome:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -266,6 +266,27 @@ def parallel(work: Callable[[Any], Any], items: Sequence[Any], jobs: int) -> Ite
     with ProcessPoolExecutor(min(jobs, len(items)), get_context("spawn")) as pool:
         for job in as_completed([pool.submit(work, item) for item in items]):
             yield job.result()
+
+
+def by_recording(
+    work: Callable[[Any], Any], cells: Sequence[Any], recording: Callable[[Any], Any], jobs: int
+) -> dict[Any, Any]:
+    """Results of the work by cell; a process keeps to the cells of one recording at a time."""
+    groups: dict[Any, list[Any]] = {}
+    for cell in cells:
+        groups.setdefault(recording(cell), []).append(cell)
+    found: dict[Any, Any] = {}
+    began = time.monotonic()
+    for done in parallel(partial(_each, work), list(groups.values()), jobs):
+        found.update(done)
+        gone = time.monotonic() - began
+        left = gone * (len(cells) / len(found) - 1.0)
+        print(f"{len(found)} of {len(cells)} cells, {gone:.0f} s, {left:.0f} s left", file=sys.stderr, flush=True)
+    return found
+
+
+def _each(work: Callable[[Any], Any], cells: Sequence[Any]) -> dict[Any, Any]:
+    return {cell: work(cell) for cell in cells}
 
 
 @contextmanager
