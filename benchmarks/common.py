@@ -8,6 +8,9 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLES = ROOT / "datasets" / "samples"
@@ -26,6 +29,23 @@ class Row:
     n: int = 1
     unit: str = ""
     reason: str = ""
+
+
+def mean_row(row_id: str, values: Iterable[float], unit: str = "") -> Row:
+    """Mean of several runs, with their standard deviation."""
+    held = np.array(list(values), dtype=float)
+    return Row(row_id, float(held.mean()), float(held.std()), len(held), unit)
+
+
+def ratio_row(row_id: str, values: Iterable[float], over: Iterable[float], unit: str = "") -> Row:
+    """Mean of several runs over that of others; the spread is that of the single ratios."""
+    first, second = (np.array(list(of_all), dtype=float) for of_all in (values, over))
+    return Row(row_id, float(first.mean() / second.mean()), float(np.std(first / second)), len(first), unit)
+
+
+def stamp_of(header: Any) -> int:
+    """Stamp of a message's header [ns]."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def not_run(ids: Iterable[str], reason: str) -> list[Row]:

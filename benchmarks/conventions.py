@@ -32,6 +32,7 @@ import yaml
 
 from benchmarks.common import DATA, SAMPLES, Row, main
 from benchmarks.field_recordings import RECORDINGS as FIELD
+from benchmarks.live import mirrored
 from fgloc.assembly import assemble
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, Role, config_of_file
@@ -170,16 +171,6 @@ def _map(change: Callable[[int, Any], tuple[int, Any]]) -> Change:
     return changed
 
 
-def _mirror(landmark_map: LandmarkMap) -> LandmarkMap:
-    """The sign of y changed; markers look along the mirrored direction, upright as before."""
-    flip, across = np.diag([1.0, -1.0, 1.0]), np.diag([-1.0, 1.0, 1.0])
-    every = {
-        i: replace(m, position=flip @ m.position, rotation=flip @ m.rotation @ across)
-        for i, m in landmark_map.landmarks.items()
-    }
-    return replace(landmark_map, landmarks=every)
-
-
 _CLOCKS = "clock.imu|clock.odometry|clock.joints|clock.sightings"  # of two, either may be wrong
 _COMMANDS = "wheels.scale|sightings.scale|commands.unit"  # the first two where commands stand in for wheels
 MISTAKES: dict[str, Mistake] = {
@@ -224,7 +215,7 @@ MISTAKES: dict[str, Mistake] = {
     "map x 0.3048": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 0.3048)), "map.unit", 0.3048, choice=False),
     "map in cm": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 100.0)), "map.unit", 0.01, choice=False),
     "map in km": Mistake(LandmarkMap, _map(lambda i, p: (i, p * 0.001)), "map.unit", 1e3),
-    "map mirrored": Mistake(LandmarkMap, _mirror, "map.mirrored"),
+    "map mirrored": Mistake(LandmarkMap, mirrored, "map.mirrored"),
     "ids off by one": Mistake(LandmarkMap, _map(lambda i, p: (i + 1, p)), "map.ids", choice=False),
     "truth in NED": Mistake(TruthEvent, _ned, "truth.axes"),
     "truth 0.5 s late": Mistake(TruthEvent, _late(0.5), "clock.truth", 0.5, 0.05),

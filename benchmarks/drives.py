@@ -108,7 +108,7 @@ import numpy as np
 import yaml
 from scipy.io import loadmat
 
-from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.common import DATA, Row, main, mean_row, not_run
 from benchmarks.field import distances, outcome
 from benchmarks.field_peers import hear
 from benchmarks.field_recordings import RECORDINGS, Recording, car_gnss, mecanum, plaza, tricycle
@@ -118,7 +118,7 @@ from benchmarks.recordings import SEEDS, Recorded, Take, cache_folder, changed, 
 from benchmarks.replays import failure, kept, replayed
 from benchmarks.scores import errors
 from fgloc import se2
-from fgloc.ablation.failures import corrupt, generators
+from fgloc.ablation.failures import Corruption
 from fgloc.calibrate import calibrate
 from fgloc.calibration.anchors import survey_anchors
 from fgloc.config import Config, config_of
@@ -128,7 +128,6 @@ from fgloc.files.atomic import atomic_folder
 from fgloc.frames import quaternion_yaw, yaw_quaternion
 from fgloc.recording.reader import open_recording
 from fgloc.runner import RunResult, run
-from fgloc.sensors.failures import Scene
 from fgloc.sensors.gnss import GnssEvent, east_north
 from fgloc.sensors.maps import load_map
 from fgloc.sensors.odometry import BesideEvent
@@ -382,7 +381,7 @@ def plaza_unknown(drives: int) -> Iterator[Row]:
         errors_m = [_rms(_aligned(*_plaza_places(result, data["GT"]))) for result in of_run]
         drove.append([errors_m[0] / errors_m[1], *errors_m])
     for name, unit, values in zip(names, ("", "m", "m"), np.array(drove).T, strict=True):
-        yield Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+        yield mean_row(name, values, unit)
         yield Row(f"{name}.largest", float(np.max(values)), n=len(values), unit=unit)
 
 
@@ -626,7 +625,7 @@ def with_odometry(seed: int, case: str | None) -> Scores:
     added = second_odometry(recorded, seed, told) if case is not None else []
     kept = [e for e in recorded.events if not isinstance(e, OdometryEvent)]
     events: Sequence[Event] = sorted([*kept, *added], key=lambda e: e.received_ns)
-    scenes = [Scene(recorded.start_ns, recorded.duration_s, config, (), rng) for rng in generators(len(chain), seed)]
+    failing = Corruption(chain, (recorded.start_ns, recorded.duration_s), config, seed=seed)
     named: list[tuple[float, bool]] = []  # when a step was judged, and whether it left the source out
 
     def note(step: Step, estimate: Estimate | None) -> None:
@@ -640,7 +639,7 @@ def with_odometry(seed: int, case: str | None) -> Scores:
         config,
         "online",
         on_step=note,
-        events=lambda _: corrupt(chain, "recorded", iter(events), scenes),
+        events=lambda _: failing.recorded(iter(events)),
     )
     metrics = compute_metrics(result, config)
     begun = recorded.truth[recorded.truth[:, 0] >= _FAILED_S[0]]
@@ -706,7 +705,7 @@ def drive_rows(quick: bool, drives: Sequence[str] = DRIVES, seeds: Sequence[int]
 def _row(name: str, values: Sequence[float], unit: str, failed: str) -> Row:
     if failed or not values:
         return Row(name, None, n=0, reason=failed or "no run")
-    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+    return mean_row(name, values, unit)
 
 
 def _cell(drive: str, case: str, seed: int) -> dict[str, Any]:
@@ -768,7 +767,6 @@ def load_made(made: Scenario, seed: int, name: str) -> Recorded:
     config = config_of(robot_settings(made) | {"motion": {"use": False}})
     with open_recording(folder / "bag", config.recording) as recording:
         start_ns, duration_s, events = recording.span_ns[0], recording.duration_s, tuple(recording.events())
-    none = np.empty(0)
     return Recorded(
         name=folder.name,
         bag=folder / "bag",
@@ -777,9 +775,6 @@ def load_made(made: Scenario, seed: int, name: str) -> Recorded:
         landmarks=load_map(folder / "map.yaml"),
         events=events,
         start_ns=start_ns,
-        slip_s=none,
-        slipping=none.astype(bool),
-        slip=np.empty((0, 3)),
         truth=truth_of(events, start_ns),
         duration_s=duration_s,
     )

@@ -31,14 +31,13 @@ from benchmarks.field_recordings import RECORDINGS
 from benchmarks.gross import MISTAKES, Mistake
 from benchmarks.gross import write as write_mistaken
 from fgloc import LandmarkMap, Live, RunResult, load_config, load_map, run, se2
-from fgloc.ablation.failures import AnyFailure, corrupt, generators
+from fgloc.ablation.failures import AnyFailure, Corruption
 from fgloc.cli import app
 from fgloc.config import config_of, file_content
 from fgloc.extensions import GROUP, outside_sensors
 from fgloc.files.settings import joined
 from fgloc.recording.reader import open_recording
 from fgloc.replay import RunMode
-from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import write_map
 from fgloc.types import Estimate, Event, FloatArray, Landmark
 from fgloc_datasets.bag import BagWriter
@@ -402,11 +401,9 @@ def _run(
     if failures:
         chain = TypeAdapter(list[AnyFailure]).validate_python(list(failures))
         with open_recording(bag, config.recording) as recorded:
-            start_ns, duration_s = recorded.span_ns[0], recorded.duration_s
-        ids = () if map_path is None else tuple(sorted(load_map(map_path).landmarks))
-        scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(chain), 0)]
-        options["events"] = lambda events: corrupt(chain, "recorded", events, scenes)
-        options["sightings"] = lambda events: corrupt(chain, "sightings", events, scenes)
+            span = recorded.span_ns[0], recorded.duration_s
+        failing = Corruption(chain, span, config, None if map_path is None else load_map(map_path))
+        options |= {"events": failing.recorded, "sightings": failing.sightings}
     elif seconds < math.inf:
         options["events"] = partial(_first, seconds)
     return of_run(run(bag, map_path, config, mode, **options), place)

@@ -19,6 +19,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from benchmarks.common import stamp_of
 from benchmarks.field_recordings import Recording
 from fgloc import se2
 from fgloc.frames import quaternion_yaw, yaw_quaternion
@@ -127,39 +128,17 @@ def _late(kinds: tuple[str, ...], seconds: float) -> Change:
     return change
 
 
-def _stamped(kinds: tuple[str, ...], seconds: float) -> Change:
-    """Stamps of these kinds are off."""
-
-    def change(messages: Messages, _: random.Random) -> Messages:
-        for m in messages:
-            if m.kind in kinds:
-                _shift(m, round(seconds * _S))
-        return messages
-
-    return change
-
-
-def _stepped(kinds: tuple[str, ...], seconds: float) -> Change:
-    """Stamps of these kinds jump at a moment."""
+def _stamped(kinds: tuple[str, ...], seconds: float, jump: bool = False) -> Change:
+    """Stamps of these kinds are off; ``jump``: from a moment on."""
 
     def change(messages: Messages, rng: random.Random) -> Messages:
-        at = _moment(messages, rng)
-        for m in messages:
-            if m.kind in kinds and m.received >= at:
-                _shift(m, round(seconds * _S))
+        since = _moment(messages, rng) if jump else 0
+        for header in (h for m in messages if m.kind in kinds and m.received >= since for h in _headers(m.message)):
+            total = stamp_of(header) + round(seconds * _S)
+            header.stamp.sec, header.stamp.nanosec = total // _S, total % _S
         return messages
 
     return change
-
-
-def _shift(m: Heard, by_ns: int) -> None:
-    for header in (
-        [m.message.header, *(k.header for k in getattr(m.message, "markers", ()) if hasattr(k, "header"))]
-        if hasattr(m.message, "header")
-        else ()
-    ):
-        total = int(header.stamp.sec) * _S + int(header.stamp.nanosec) + by_ns
-        header.stamp.sec, header.stamp.nanosec = total // _S, total % _S
 
 
 def _headers(message: Any) -> list[Any]:
@@ -293,22 +272,19 @@ def _each(edit: Callable[[Any, random.Random], None]) -> Change:
     def change(messages: Messages, rng: random.Random) -> Messages:
         for m in messages:
             if m.kind in _SIGHTINGS:
-                for one in m.message.landmarks if m.kind == "LandmarkArray" else m.message.markers:
+                for one in _sighted(m):
                     edit(one, rng)
         return messages
 
     return change
 
 
+def _sighted(m: Heard) -> list[Any]:
+    return list(m.message.landmarks if m.kind == "LandmarkArray" else m.message.markers)
+
+
 def _ids(messages: Messages) -> list[int]:
-    return sorted(
-        {
-            int(one.id)
-            for m in messages
-            if m.kind in _SIGHTINGS
-            for one in (m.message.landmarks if m.kind == "LandmarkArray" else m.message.markers)
-        }
-    )
+    return sorted({int(one.id) for m in messages if m.kind in _SIGHTINGS for one in _sighted(m)})
 
 
 def _misread(share: float) -> Change:
@@ -329,8 +305,10 @@ def _seen(distance: float = 1.0, turn: float = 0.0, noise: float = 0.0, wild: fl
 
     def edit(one: Any, rng: random.Random) -> None:
         if hasattr(one, "range"):
-            r, b = float(one.range), float(one.bearing)
-            r, b = _moved(r, b, rng)
+            r = float(one.range) * (distance + rng.gauss(0.0, noise))
+            b = float(one.bearing) + turn + rng.gauss(0.0, noise)
+            if rng.random() < wild:
+                r, b = r * rng.uniform(0.5, 2.0), b + rng.uniform(-0.7, 0.7)
             one.range, one.bearing = r, b
             return
         p = one.pose.pose.position  # the axis that is up is not known: a pose is not turned
@@ -338,12 +316,6 @@ def _seen(distance: float = 1.0, turn: float = 0.0, noise: float = 0.0, wild: fl
         if rng.random() < wild:
             k *= rng.uniform(0.5, 2.0)
         p.x, p.y, p.z = p.x * k, p.y * k, p.z * k
-
-    def _moved(r: float, b: float, rng: random.Random) -> tuple[float, float]:
-        r, b = r * (distance + rng.gauss(0.0, noise)), b + turn + rng.gauss(0.0, noise)
-        if rng.random() < wild:
-            r, b = r * rng.uniform(0.5, 2.0), b + rng.uniform(-0.7, 0.7)
-        return r, b
 
     return _each(edit)
 
@@ -418,7 +390,7 @@ CHANGES: dict[str, Change] = {
     "landmarks_stamped_late": _stamped(_SIGHTINGS, 0.3),
     "odometry_stamped_late": _stamped(("Odometry",), 0.3),
     "landmarks_clock": _stamped(_SIGHTINGS, 7200.0),
-    "odometry_clock_steps": _stepped(("Odometry",), 1.0),
+    "odometry_clock_steps": _stamped(("Odometry",), 1.0, jump=True),
     "jittered": _jittered,
     "unstamped": _unstamped,
     "far": _scaled(1.25, 1.0),

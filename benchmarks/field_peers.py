@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 from rosbags.highlevel import AnyReader
 
+from benchmarks.common import stamp_of
 from fgloc import se2
 from fgloc.frames import quaternion_yaw
 from fgloc.recording.messages import default_typestore
@@ -91,7 +92,7 @@ def hear(bag: Path, truth_topic: str) -> Heard:
             if name != truth_topic and kind not in _READ:
                 continue
             m: Any = reader.deserialize(raw, connection.msgtype)
-            stamp = _stamp(m, received)
+            stamp = stamp_of(m.header) if hasattr(m, "header") else received
             if name == truth_topic:
                 degrees = kind == "NavSatFix"
                 truth.append((stamp, received, *_place(m, kind)))
@@ -271,9 +272,3 @@ def _place(m: Any, kind: str) -> tuple[float, float, float]:
 
 def _yaw(q: Any) -> float:
     return quaternion_yaw(np.array([q.x, q.y, q.z, q.w]))
-
-
-def _stamp(m: Any, received: int) -> int:
-    if not hasattr(m, "header"):
-        return received
-    return int(m.header.stamp.sec) * 1_000_000_000 + int(m.header.stamp.nanosec)

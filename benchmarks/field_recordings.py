@@ -24,7 +24,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.io import loadmat
 
-from benchmarks.common import DATA
+from benchmarks.common import DATA, stamp_of
 from fgloc import se2
 from fgloc.frames import yaw_quaternion
 from fgloc.sensors.maps import write_map
@@ -159,7 +159,7 @@ def mecanum(source: Path, out: Path, share: float = 1.0) -> None:
         until = reader.start_time + round(share * reader.duration) + 1
         for connection, received, raw in reader.messages(stop=until):
             m: Any = reader.deserialize(raw, connection.msgtype)
-            stamp = _stamp(m)
+            stamp = stamp_of(m.header)
             if connection.topic == "/wheel_states":
                 joints.append((received, stamp, np.array(m.position)))
                 arrays = (m.position.tolist(), m.velocity.tolist(), m.effort.tolist())
@@ -244,11 +244,11 @@ def car_gnss(source: Path, out: Path) -> None:
             if connection.topic in antennas:
                 place = (m.latitude, m.longitude, m.altitude)
                 frame = antennas[connection.topic][0]
-                bag.satellite_fix("/fix", _stamp(m), place, (0.0, 0.0, 0.0), received, frame)
+                bag.satellite_fix("/fix", stamp_of(m.header), place, (0.0, 0.0, 0.0), received, frame)
             else:
                 steering, speed = math.radians(m.point.x), m.point.y / 3.6
                 arrays = ((steering, math.nan), (math.nan, speed))
-                bag.joints("/joints", _stamp(m), ("steering_wheel", "speed"), *arrays, received_ns=received)
+                bag.joints("/joints", stamp_of(m.header), ("steering_wheel", "speed"), *arrays, received_ns=received)
 
 
 def plaza(source: Path, out: Path, since: float = 0.0) -> None:
@@ -403,10 +403,6 @@ def _twists(seconds: FloatArray, poses: FloatArray) -> FloatArray:
     """Body twists ``(n, 3)`` by differences of poses."""
     steps = np.array([se2.between(a, b) for a, b in pairwise(poses)])
     return np.vstack([np.zeros(3), steps / np.maximum(np.diff(seconds), 1e-3)[:, None]])
-
-
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
 
 
 # --- all --------------------------------------------------------------------------------------------------------------

@@ -31,28 +31,22 @@ checks before a run.
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks.common import ROOT, Row, main, not_run
-from benchmarks.recordings import cache_folder
+from benchmarks.common import Row, main, mean_row, not_run, ratio_row
+from benchmarks.replays import kept, parallel
 from fgloc.config import Config, load_config
 from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import compute_metrics, match_result
-from fgloc.files.atomic import atomic_file
 from fgloc.runner import run
 from fgloc_datasets.sim.camera import RenderError
 from fgloc_datasets.sim.following.cases import drive_of
@@ -129,8 +123,7 @@ def _mean(field: str, unit: str) -> Callable[[str, Sequence[Sequence[Driven]]], 
     """Mean and standard deviation over the seeds."""
 
     def row(row_id: str, drives: Sequence[Sequence[Driven]]) -> Row:
-        values = [float(getattr(d, field)) for d in drives[0]]
-        return Row(row_id, float(np.mean(values)), float(np.std(values)), len(values), unit)
+        return mean_row(row_id, [float(getattr(d, field)) for d in drives[0]], unit)
 
     return row
 
@@ -139,8 +132,8 @@ def _over(field: str) -> Callable[[str, Sequence[Sequence[Driven]]], Row]:
     """Mean of a figure over that of other drives."""
 
     def row(row_id: str, drives: Sequence[Sequence[Driven]]) -> Row:
-        first, second = (np.array([float(getattr(d, field)) for d in same]) for same in drives)
-        return Row(row_id, float(first.mean() / second.mean()), float(np.std(first / second)), len(first))
+        first, second = ([float(getattr(d, field)) for d in same] for same in drives)
+        return ratio_row(row_id, first, second)
 
     return row
 
@@ -174,46 +167,25 @@ def run_all(cells: Sequence[Cell], jobs: int | None = None) -> dict[Cell, Driven
     """All drives, from the cache or driven now."""
     found: dict[Cell, Driven] = {}
     began = time.monotonic()
-    with ProcessPoolExecutor(jobs or os.cpu_count() or 1, get_context("spawn")) as pool:
-        waiting = {pool.submit(kept_drive, cell): cell for cell in cells}
-        for job in as_completed(waiting):
-            found[waiting[job]] = job.result()
-            left = (time.monotonic() - began) * (len(cells) / len(found) - 1.0)
-            print(f"{len(found)} of {len(cells)} drives, {left:.0f} s left", file=sys.stderr, flush=True)
+    for cell, driven in parallel(_kept_drive, cells, jobs or os.cpu_count() or 1):
+        found[cell] = driven
+        left = (time.monotonic() - began) * (len(cells) / len(found) - 1.0)
+        print(f"{len(found)} of {len(cells)} drives, {left:.0f} s left", file=sys.stderr, flush=True)
     return found
 
 
-def kept_drive(cell: Cell) -> Driven:
-    """A drive from the cache, or driven now and put there."""
-    sees = "corners" if cell.corners else "images"
-    path = cache_folder() / "follow" / f"{cell.case}_{cell.pose}_{cell.seed}_{sees}_{source_hash()}.json"
-    if path.is_file():
-        return Driven(**json.loads(path.read_text(encoding="utf-8")))
-    made = _drive(cell)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(path) as file:
-        json.dump(asdict(made), file)
-    print(f"  {cell.case} {cell.pose} {cell.seed}: {made}", file=sys.stderr, flush=True)
-    return made
+def _kept_drive(cell: Cell) -> tuple[Cell, Driven]:
+    """A drive from the cache, or driven now."""
+    sees: Literal["corners", "images"] = "corners" if cell.corners else "images"
 
+    def drive() -> dict[str, Any]:
+        try:
+            score = follow(drive_of(cell.case, cell.pose, cell.seed, sees)).score
+        except FglocError as error:
+            return asdict(Driven(failed=str(error)))
+        return asdict(Driven(score.track_mm, score.reached, score.arrived, score.pose_mm, score.seconds))
 
-def _drive(cell: Cell) -> Driven:
-    try:
-        score = follow(drive_of(cell.case, cell.pose, cell.seed, "corners" if cell.corners else "images")).score
-    except FglocError as error:
-        return Driven(failed=str(error))
-    return Driven(score.track_mm, score.reached, score.arrived, score.pose_mm, score.seconds)
-
-
-@cache
-def source_hash() -> str:
-    """Hash of fgloc's sources and of this module."""
-    made = hashlib.sha256()
-    files = sorted(p for p in (ROOT / "fgloc").rglob("*") if p.suffix in (".py", ".safetensors", ".yaml"))
-    for path in [*files, Path(__file__)]:
-        made.update(path.relative_to(ROOT).as_posix().encode())
-        made.update(path.read_bytes())
-    return made.hexdigest()[:12]
+    return cell, Driven(**kept(f"follow_{cell.case}_{cell.pose}_{cell.seed}_{sees}", drive, Path(__file__)))
 
 
 # --- Ground that is not flat ------------------------------------------------------------------------------------------
@@ -243,18 +215,14 @@ class OnGround:
 
 def measured(case: str, seed: int) -> OnGround:
     """One drive's figures, from the cache or driven now."""
-    path = cache_folder() / "follow" / f"ground_{case}_{seed}_{source_hash()}.json"
-    if path.is_file():
-        return OnGround(**json.loads(path.read_text(encoding="utf-8")))
-    try:
-        made = _drive_on_ground(case, seed)
-    except FglocError as error:
-        made = OnGround(failed=str(error))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(path) as file:
-        json.dump(asdict(made), file)
-    print(f"  {case} {seed}: {made}", file=sys.stderr, flush=True)
-    return made
+
+    def drive() -> dict[str, Any]:
+        try:
+            return asdict(_drive_on_ground(case, seed))
+        except FglocError as error:
+            return asdict(OnGround(failed=str(error)))
+
+    return OnGround(**kept(f"ground_{case}_{seed}", drive, Path(__file__)))
 
 
 def _drive_on_ground(case: str, seed: int) -> OnGround:
@@ -330,21 +298,16 @@ def ground(seeds: Sequence[int]) -> Iterator[Row]:
     """All rows over these seeds."""
     drives = {case: [measured(case, seed) for seed in seeds] for case in _GUIDE}
     for row_id, case, figure, unit in GROUND_ROWS:
-        yield _ground_row(row_id, drives[case], lambda d, f=figure: getattr(d, f), unit)  # type: ignore[misc]
+        yield _failed(row_id, drives[case]) or mean_row(row_id, [getattr(d, figure) for d in drives[case]], unit)
     for row_id, case, figure, over in GROUND_RATIOS:
-        kept = drives[case]
-        first, second = (np.array([getattr(d, name) for d in kept]) for name in (figure, over))
-        failed = next((d.failed for d in kept if d.failed), "")
-        value = None if failed else float(first.mean() / second.mean())
-        yield Row(row_id, value, None if failed else float(np.std(first / second)), len(kept), "", failed)
+        first, second = ([getattr(d, name) for d in drives[case]] for name in (figure, over))
+        yield _failed(row_id, drives[case]) or ratio_row(row_id, first, second)
 
 
-def _ground_row(row_id: str, drives: Sequence[OnGround], figure: Callable[[OnGround], float], unit: str) -> Row:
-    failed = next((d.failed for d in drives if d.failed), "")
-    values = np.array([figure(d) for d in drives])
-    if failed:
-        return Row(row_id, None, None, len(drives), unit, failed)
-    return Row(row_id, float(values.mean()), float(values.std()), len(drives), unit)
+def _failed(row_id: str, drives: Sequence[OnGround]) -> Row | None:
+    """A row with the reason why there is no value; None: no drive failed."""
+    why = next((d.failed for d in drives if d.failed), "")
+    return Row(row_id, None, n=len(drives), reason=why) if why else None
 
 
 if __name__ == "__main__":

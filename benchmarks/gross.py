@@ -29,7 +29,7 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from benchmarks.common import SAMPLES, Row, main, not_run
+from benchmarks.common import SAMPLES, Row, main, mean_row, not_run
 from benchmarks.recordings import SEEDS, Split, Take, cache_folder, folder, prepare
 from fgloc.cli.terminal import EXIT_BAD_INPUT, exit_code
 from fgloc.config import file_content, load_config
@@ -121,7 +121,7 @@ def _rows(sound: Sequence[Outcome], wrong: dict[str, list[Outcome]]) -> Iterator
         told.append([names(said, o.info) for o in outcomes])
         ratios.append([o.seconds / s.seconds for o, s in zip(outcomes, sound, strict=False)])
     for name, good, times in zip(wrong, named, ratios, strict=True):
-        yield Row(f"gross.{name}.named", float(np.mean(good)), float(np.std(good)), len(good))
+        yield mean_row(f"gross.{name}.named", good)
         yield Row(f"gross.{name}.seconds", float(np.max(times)), float(np.std(times)), len(times))
     count = sum(map(len, named))
     yield Row("gross.named", float(np.mean(named)), float(np.std(np.mean(named, axis=1))), count)

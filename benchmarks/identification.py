@@ -37,7 +37,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.common import DATA, Row, main, mean_row, not_run
 from benchmarks.recordings import MRCLAM
 from fgloc.config import load_config
 from fgloc.recording.reader import open_recording
@@ -116,16 +116,12 @@ def _tested(path: Path, split: Split, runs: dict[str, Run], dt_s: float = STEP_S
     return [roll_model(model, runs[name], dt_s) for name in split.test]
 
 
-def _row(name: str, values: list[float], unit: str = "") -> Row:
-    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
-
-
 def _coverages(prefix: str, per_seed: list[list[Rollout]], horizons_s: dict[str, float]) -> Iterator[Row]:
     """Shares of the errors within one, two and three sigmas, by label of the horizon."""
     for label, horizon_s in horizons_s.items():
         shares = np.array([evaluate(rollouts, horizon_s).coverage for rollouts in per_seed], dtype=float)
         for i, column in enumerate(shares.T, 1):
-            yield _row(f"{prefix}.{label}{i}", column.tolist())
+            yield mean_row(f"{prefix}.{label}{i}", column.tolist())
 
 
 def _ends(rollouts: list[Rollout], horizon_s: float) -> tuple[float, float]:
@@ -160,10 +156,10 @@ def _mrclam(scratch: Path, seeds: range, optimization: OptimizationConfig) -> It
     parts, split = _parts(runs)
     seen = [_tested(trained(seed, split, parts), split, parts) for seed in seeds]
     yield from _figures("seen", seen)
-    yield _row("seen.yaw_10s_deg", [evaluate(r, 10.0).yaw_end_deg for r in seen], "deg")
+    yield mean_row("seen.yaw_10s_deg", [evaluate(r, 10.0).yaw_end_deg for r in seen], "deg")
     left_out = [[(trained(seed, split, runs), split) for split in leave_one_out(list(runs))] for seed in seeds]
     yield from _figures("loro", [[r for path, s in models for r in _tested(path, s, runs)] for models in left_out])
-    yield _row("train.minutes", minutes, "min")
+    yield mean_row("train.minutes", minutes, "min")
     yield from _finetuned(left_out, runs)
 
 
@@ -214,7 +210,7 @@ def _figures(on: str, per_seed: list[list[Rollout]]) -> Iterator[Row]:
 
 def _drifts(prefix: str, per_seed: list[list[Rollout]]) -> Iterator[Row]:
     for horizon in _HORIZONS_S:
-        yield _row(f"{prefix}drift_{horizon:.0f}s", [evaluate(r, horizon).drift_percent for r in per_seed], "%")
+        yield mean_row(f"{prefix}drift_{horizon:.0f}s", [evaluate(r, horizon).drift_percent for r in per_seed], "%")
 
 
 # --- Husky ------------------------------------------------------------------------------------------------------------
@@ -252,7 +248,7 @@ def _husky(scratch: Path, seeds: range, optimization: OptimizationConfig) -> Ite
             per_seed.append(_tested(path, split, runs, _HUSKY_DT_S))
         ends = np.array([_ends(rollouts, _HUSKY_S) for rollouts in per_seed])
         for unit, column in zip(("m", "rad"), ends.T, strict=True):
-            yield _row(f"{name}.end_{unit}", column.tolist(), unit)
+            yield mean_row(f"{name}.end_{unit}", column.tolist(), unit)
         yield from _coverages(name, per_seed, {"cov": _HUSKY_DT_S, "cov1500ms_": _HUSKY_S})
 
 
@@ -316,7 +312,7 @@ def _simulated(quick: bool, seeds: range, optimization: OptimizationConfig, scra
                     network=NetworkConfig(inputs=inputs),
                 )
                 per_seed.append(_tested(path, split, runs))
-            yield _row(f"sim.{name}_ratio", [_ends(rollouts, _SIM_S)[0] / wheels for rollouts in per_seed])
+            yield mean_row(f"sim.{name}_ratio", [_ends(rollouts, _SIM_S)[0] / wheels for rollouts in per_seed])
             yield from _coverages(f"sim.{name}", per_seed, {"cov": STEP_S, "cov10s_": 10.0})
 
 

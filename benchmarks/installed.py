@@ -16,8 +16,6 @@ pipelines (`benchmarks.textbook`) over that of fgloc without learned motion, bot
   mean square over the markers of a run, of their distance from where they hang and of the angle by which they are
   turned, after SE(3) alignment of the places; ``map.images.missing`` counts the markers that hang there and are not in
   the map. ``map.fed_back.ate_mm``: mean distance from the truth after SE(2) alignment.
-- ``mrclam.*``: MRCLAM 6, five real robots, each with the constants and the model of the other four.
-  ``first_pose_s`` is from a robot's first motion (the first command to move) to its first pose.
 
 Settings are chosen on the training and validation splits; the rows are of the test split. Finished cells are kept
 (`benchmarks.replays`), so that an interrupted run goes on.
@@ -28,21 +26,17 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.common import Row, main, not_run
+from benchmarks.common import Row, main, mean_row, not_run, ratio_row
 from benchmarks.recordings import (
-    MRCLAM,
     SEEDS,
     Recorded,
     Split,
@@ -50,12 +44,11 @@ from benchmarks.recordings import (
     Variant,
     cache_folder,
     changed,
-    converted,
     folder,
     load,
     prepare,
 )
-from benchmarks.replays import Replayed, failures, floor, kept, parallel, processor_times, replayed
+from benchmarks.replays import Replayed, by_recording, failures, floor, kept, processor_times, replayed
 from benchmarks.scores import (
     Scores,
     errors,
@@ -74,8 +67,7 @@ from fgloc.errors import FglocError
 from fgloc.evaluation.metrics import match, match_result
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map, write_map
-from fgloc.types import Estimate, LandmarkMap, Step, Trajectory
-from fgloc_datasets import mrclam
+from fgloc.types import LandmarkMap, Trajectory
 from fgloc_datasets.sim.camera import RenderError
 from fgloc_datasets.sim.installed import INSTALLED, load_installed
 from fgloc_datasets.sim.scenario import Markers
@@ -98,12 +90,6 @@ _MAPS = {
     "map.fed_back.ate_mm": "mm",
 }
 _MAPPED = 3  # seeds of the validation split that are mapped
-_MODES = ("batch", "online")
-MRCLAM_IDS = (
-    "mrclam.first_pose_s",
-    *(f"mrclam.{mode}.{figure}" for mode in _MODES for figure in ("ate_mean_m", "nees_over_3")),
-    *(f"mrclam.robot{robot}.{mode}.nees_over_3" for robot in mrclam.ROBOTS for mode in _MODES),
-)
 _LEFT_OUT = "left out of a quick run"
 _Figure = Callable[[Scores], float | None]
 
@@ -147,20 +133,19 @@ def measure(
     cells = {cell for w in todo for cell in w.cells(split, seeds)}
     try:
         prepare(cell.take for cell in cells)
-        found = run_all(sorted(cells), jobs) if cells else {}
+        found = by_recording(scores_of, sorted(cells), attrgetter("take"), jobs)
     except RenderError as error:
         yield from not_run([w.id for w in rows], str(error))
     else:
         for w in rows:
             of_seeds = [found[cell] for cell in w.cells(split, seeds)] if w in todo else []
             yield w.row(w.id, of_seeds) if of_seeds else not_run([w.id], _LEFT_OUT)[0]
-    for ids, part in ((tuple(_MAPS), maps(quick, split)), (MRCLAM_IDS, robots(quick, jobs))):
-        if any(row_id.startswith(tuple(prefixes)) for row_id in ids):
-            yield from (row for row in part if row.id.startswith(tuple(prefixes)))
+    if any(row_id.startswith(tuple(prefixes)) for row_id in _MAPS):
+        yield from (row for row in maps(quick, split) if row.id.startswith(tuple(prefixes)))
 
 
 def wanted() -> Iterator[Wanted]:
-    """All rows but those of maps and of MRCLAM."""
+    """All rows but those of maps."""
     for case in CASES:
         yield Wanted(f"{case}.batch.nees_over_3", _mean(lambda s: s.batch and s.batch.nees_over_3), case)
         yield Wanted(f"{case}.online.nees_over_3", _mean(lambda s: s.online and s.online.nees_over_3), case)
@@ -201,7 +186,7 @@ def _mean(figure: _Figure, unit: str = "") -> Callable[[str, Sequence[Scores]], 
 
     def row(row_id: str, scores: Sequence[Scores]) -> Row:
         values, missing = _values(row_id, scores, figure)
-        return missing or Row(row_id, float(np.mean(values)), float(np.std(values)), len(values), unit)
+        return missing or mean_row(row_id, values, unit)
 
     return row
 
@@ -245,7 +230,7 @@ def best_over_fgloc(row_id: str, scores: Sequence[Scores]) -> Row:
     best = min(theirs.values(), key=lambda values: float(values.mean()))
     if not np.isfinite(best).all():
         return Row(row_id, None, n=len(scores), reason="no pipeline of the textbook found a pose in every run")
-    return Row(row_id, float(best.mean() / np.mean(ours)), float(np.std(best / ours)), len(scores))
+    return ratio_row(row_id, best, ours)
 
 
 def _values(row_id: str, scores: Sequence[Scores], figure: _Figure) -> tuple[list[float], Row | None]:
@@ -260,23 +245,6 @@ def _values(row_id: str, scores: Sequence[Scores], figure: _Figure) -> tuple[lis
 
 
 # --- Many cells -------------------------------------------------------------------------------------------------------
-
-
-def run_all(cells: Sequence[Cell], jobs: int) -> dict[Cell, Scores]:
-    """Scores of all cells, from the cache or run now; a process keeps to one recording."""
-    groups = [list(group) for _, group in groupby(sorted(cells), key=lambda cell: cell.take)]
-    found: dict[Cell, Scores] = {}
-    began = time.monotonic()
-    for done in parallel(_run_group, groups, jobs):
-        found.update(done)
-        gone = time.monotonic() - began
-        left = gone * (len(cells) / len(found) - 1.0)
-        print(f"{len(found)} of {len(cells)} cells, {gone:.0f} s, {left:.0f} s left", file=sys.stderr, flush=True)
-    return found
-
-
-def _run_group(cells: Sequence[Cell]) -> dict[Cell, Scores]:
-    return {cell: scores_of(cell) for cell in cells}
 
 
 def scores_of(cell: Cell) -> Scores:
@@ -362,7 +330,7 @@ def maps(quick: bool, split: Split) -> Iterator[Row]:
         return
     for name, unit in _MAPS.items():
         values = [float(f[name]) for f in found]
-        yield Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
+        yield mean_row(name, values, unit)
 
 
 def mapped(run_folder: Path) -> Mapping[str, float | str]:
@@ -409,67 +377,6 @@ def _fed_back(bag: Path, map_path: Path, config: Config) -> float:
     if matched is None:
         return math.nan
     return 1e3 * float(matched.distances.mean())
-
-
-# --- Real robots ------------------------------------------------------------------------------------------------------
-
-
-def robots(quick: bool, jobs: int) -> Iterator[Row]:
-    """Rows of MRCLAM 6; a quick run takes one robot. There is one split: no robot's settings have seen its own run."""
-    if not MRCLAM.is_dir():
-        yield from not_run(MRCLAM_IDS, f"no {MRCLAM}; set FGLOC_REAL_DATA")
-        return
-    yield from robot_rows(dict(sorted(parallel(_robot, (3,) if quick else mrclam.ROBOTS, jobs))))
-
-
-def robot_rows(found: Mapping[int, Mapping[str, float]]) -> Iterator[Row]:
-    """Rows of the figures that `localized` gave for each robot."""
-    yield _robots("mrclam.first_pose_s", [f["first_pose_s"] for f in found.values()], "s")
-    for mode in _MODES:
-        yield _robots(f"mrclam.{mode}.ate_mean_m", [f[f"{mode}.ate_mean_m"] for f in found.values()], "m")
-        yield _robots(f"mrclam.{mode}.nees_over_3", [f[f"{mode}.nees_over_3"] for f in found.values()])
-    for robot in mrclam.ROBOTS:
-        for mode in _MODES:
-            name = f"mrclam.robot{robot}.{mode}.nees_over_3"
-            if robot in found:
-                yield Row(name, found[robot][f"{mode}.nees_over_3"])
-            else:
-                yield from not_run([name], _LEFT_OUT)
-
-
-def _robots(row_id: str, values: Sequence[float], unit: str = "") -> Row:
-    return Row(row_id, float(np.mean(values)), float(np.std(values)), len(values), unit)
-
-
-def _robot(robot: int) -> tuple[int, Mapping[str, Any]]:
-    return robot, kept(f"mrclam_robot{robot}", lambda: localized(robot))
-
-
-def localized(robot: int) -> dict[str, float]:
-    """Figures of one robot, online and smoothed from the same replay."""
-    with tempfile.TemporaryDirectory() as scratch:
-        bag, map_path, config = converted(robot, Path(scratch))
-        estimates: list[Estimate] = []
-        moved_ns: list[int] = []
-
-        def note(step: Step, estimate: Estimate | None) -> None:
-            if not moved_ns:
-                moved_ns.extend(c.stamp_ns for c in step.controls if c.v or c.omega)
-            if estimate is not None:
-                estimates.append(estimate)
-
-        smoothed = run(bag, map_path, config, "batch", on_step=note)
-    trajectory = Trajectory(
-        np.array([e.stamp_ns for e in estimates], dtype=np.int64),
-        np.array([e.pose for e in estimates]),
-        np.array([e.cov for e in estimates]),
-    )
-    told = {"online": replace(smoothed, trajectory=trajectory), "batch": smoothed}
-    out = {"first_pose_s": max(estimates[0].stamp_ns - moved_ns[0], 0) * 1e-9}
-    for mode, result in told.items():
-        found = errors(result, config)
-        out |= {f"{mode}.ate_mean_m": 1e-3 * found.ate_mm, f"{mode}.nees_over_3": found.nees_over_3}
-    return out
 
 
 if __name__ == "__main__":

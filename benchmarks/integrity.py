@@ -39,7 +39,7 @@ import yaml
 from scipy.special import betaincinv
 
 from benchmarks import fleet
-from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.common import DATA, Row, main, mean_row, not_run
 from benchmarks.field_recordings import RECORDINGS
 from benchmarks.mechanisms import CASES, PUSHED, chain, floor_of, settings
 from benchmarks.recordings import SEEDS, Split, Take, changed, load, prepare
@@ -191,7 +191,7 @@ def _fleet(hours: float, jobs: int) -> Iterator[Row]:
     yield from _rows("integrity.fleet", {case: of_case for case, of_case in runs.items() if of_case})
     if twice:
         shares = [float(run.beyond.mean()) for run in twice]
-        yield Row("integrity.fleet.exceeded.twice", float(np.mean(shares)), float(np.std(shares)), len(shares))
+        yield mean_row("integrity.fleet.exceeded.twice", shares)
 
 
 def _rows(prefix: str, runs: dict[str, list[Held]]) -> Iterator[Row]:
@@ -206,7 +206,7 @@ def _rows(prefix: str, runs: dict[str, list[Held]]) -> Iterator[Row]:
     yield Row(f"{prefix}.exceeded.all", float(np.concatenate([r.beyond for r in every]).mean()), n=len(every))
     for case, of_case in runs.items():
         shares = [float(run.beyond.mean()) for run in of_case]
-        yield Row(f"{prefix}.exceeded.{case}", float(np.mean(shares)), float(np.std(shares)), len(shares), "share")
+        yield mean_row(f"{prefix}.exceeded.{case}", shares, "share")
     dangerous = sum(int((run.beyond & ~run.alert & run.wrong).sum()) for run in every)
     yield Row(f"{prefix}.dangerous", dangerous, n=len(every), unit="poses")
     sound = runs["none"]
@@ -215,9 +215,9 @@ def _rows(prefix: str, runs: dict[str, list[Held]]) -> Iterator[Row]:
     for case in ("none", "slip", "dark30"):
         if of_case := runs.get(case, []):
             shares = [float((run.bound < _LIMIT_M).mean()) for run in of_case]
-            yield Row(f"{prefix}.available.{case}", float(np.mean(shares)), float(np.std(shares)), len(shares))
+            yield mean_row(f"{prefix}.available.{case}", shares)
     if ratios := [run.step_over_none for run in sound if run.step_over_none > 1.0]:
-        yield Row(f"{prefix}.step_over_none", float(np.mean(ratios)), float(np.std(ratios)), len(ratios))
+        yield mean_row(f"{prefix}.step_over_none", ratios)
     yield Row(f"{prefix}.alert_s", max(run.alert_s for run in every), n=len(every), unit="s")
 
 

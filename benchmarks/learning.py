@@ -43,7 +43,7 @@ import torch
 
 import fgloc_training
 from benchmarks import drives
-from benchmarks.common import MODELS, Row, main
+from benchmarks.common import MODELS, Row, main, mean_row
 from benchmarks.recordings import SEEDS, Recorded, Split, Take, cache_folder, changed, load, scenario
 from benchmarks.replays import failure, failures, kept, parallel, replayed
 from benchmarks.scores import errors
@@ -123,12 +123,8 @@ def measure(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
         for c in changes
         for s in seeds
     ]
-    yield _row("step_over_frozen", ratios)
+    yield mean_row("step_over_frozen", ratios)
     yield from _installed(quick, split, jobs)
-
-
-def _row(name: str, values: Sequence[float], unit: str = "") -> Row:
-    return Row(name, float(np.mean(values)), float(np.std(values)), len(values), unit)
 
 
 def _floor(found: dict[Cell, dict[str, Any]], changes: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
@@ -144,7 +140,7 @@ def _floor(found: dict[Cell, dict[str, Any]], changes: Sequence[str], seeds: Seq
         yield Row(f"floor.{change}.drift30_over_native", drifts["adapted"] / drifts["native"], n=len(seeds))
         yield Row(f"floor.{change}.frozen_over_native", drifts["frozen"] / drifts["native"], n=len(seeds))
         nees = [found[Cell(change, s, "commands", "adapted")]["nees_over_3"] for s in seeds]
-        yield _row(f"floor.{change}.nees_over_3", nees)
+        yield mean_row(f"floor.{change}.nees_over_3", nees)
         for s in seeds:
             ate = {way: found[Cell(change, s, "commands", way)]["ate_mm"] for way in WAYS}
             worse += ate["adapted"] > _WORSE * min(ate["frozen"], ate["none"])
@@ -156,17 +152,17 @@ def _worth(found: dict[Cell, dict[str, Any]], changes: Sequence[str], seeds: Seq
         for change in changes:
             for way in (w for w in WAYS if w != "native"):
                 ate = [found[Cell(change, s, sensors, way)]["ate_mm"] for s in seeds]
-                yield _row(f"worth.{sensors}.{change}.{way}.ate_mm", ate, "mm")
+                yield mean_row(f"worth.{sensors}.{change}.{way}.ate_mm", ate, "mm")
 
 
 def _drives(found: dict[Cell, dict[str, Any]], drives: Sequence[str], seeds: Sequence[int]) -> Iterator[Row]:
     for drive in drives:
         for way in _DRIVE_WAYS:
             runs = [found[Cell(drive, s, "commands", way)] for s in seeds]
-            yield _row(f"drive.{drive}.{way}.ate_mm", [run["ate_mm"] for run in runs], "mm")
-            yield _row(f"drive.{drive}.{way}.nees_over_3", [run["nees_over_3"] for run in runs])
+            yield mean_row(f"drive.{drive}.{way}.ate_mm", [run["ate_mm"] for run in runs], "mm")
+            yield mean_row(f"drive.{drive}.{way}.nees_over_3", [run["nees_over_3"] for run in runs])
             per_seed = [100.0 * run["ends"][0] / run["ends"][1] for run in runs]
-            yield _row(f"drive.{drive}.{way}.drift30_percent", per_seed, "%")
+            yield mean_row(f"drive.{drive}.{way}.drift30_percent", per_seed, "%")
 
 
 # --- One run ----------------------------------------------------------------------------------------------------------
@@ -307,8 +303,8 @@ def _installed(quick: bool, split: Split, jobs: int) -> Iterator[Row]:
     for kind, name in zip(kinds, ("wheels_only.dark60", "foreign.dark20"), strict=True):
         found = [cells[kind, split, seed] for seed in seeds]
         for mode in ("batch", "online"):
-            yield _row(f"{name}.{mode}.ate_mm", [cell[mode][0] for cell in found], "mm")
-            yield _row(f"{name}.{mode}.nees_over_3", [cell[mode][1] for cell in found])
+            yield mean_row(f"{name}.{mode}.ate_mm", [cell[mode][0] for cell in found], "mm")
+            yield mean_row(f"{name}.{mode}.nees_over_3", [cell[mode][1] for cell in found])
         yield Row(f"{name}.sound_named", sum(cell["named"] > 0 for cell in found) / len(found), n=len(found))
 
 

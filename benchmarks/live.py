@@ -39,7 +39,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import SAMPLES, Row, main
+from benchmarks.common import SAMPLES, Row, main, mean_row
 from benchmarks.recordings import SEEDS, Recorded, Take, load, prepare
 from fgloc import se2
 from fgloc.config import Config, Role, config_of, load_config
@@ -87,8 +87,8 @@ def timed(samples: Iterable[str], seconds: float | None) -> Iterator[Row]:
         gripping.append(sample.ratio(gripping=True))
     yield Row("live.latency_ms_p50", float(np.percentile(latencies, 50)), n=len(latencies), unit="ms")
     yield Row("live.latency_ms_p99", float(np.percentile(latencies, 99)), n=len(latencies), unit="ms")
-    yield Row("live.extrapolated_over_keyframe", float(np.mean(ratios)), float(np.std(ratios)), len(ratios))
-    yield Row("live.extrapolated_gripping", float(np.mean(gripping)), float(np.std(gripping)), len(gripping))
+    yield mean_row("live.extrapolated_over_keyframe", ratios)
+    yield mean_row("live.extrapolated_gripping", gripping)
 
 
 class _Timed:
@@ -185,8 +185,8 @@ def disorder(seeds: Iterable[int]) -> Iterator[Row]:
         wild = _errors(recorded, disordered(recorded.events, recorded.start_ns, rng))
         keyframes.append(wild[0] / orderly[0])
         now.append(wild[1] / orderly[1])
-    yield Row("live.disorder_ate_ratio", float(np.mean(keyframes)), float(np.std(keyframes)), len(keyframes))
-    yield Row("live.disorder_now_ratio", float(np.mean(now)), float(np.std(now)), len(now))
+    yield mean_row("live.disorder_ate_ratio", keyframes)
+    yield mean_row("live.disorder_now_ratio", now)
 
 
 def _errors(recorded: Recorded, events: Iterable[Event]) -> tuple[float, float]:
@@ -392,7 +392,7 @@ def wrong(quick: bool) -> Iterator[Row]:
     takes = [Take("installed", "unequal_radii", "test", seed) for seed in SEEDS["test"][: 1 if quick else 5]]
     prepare(takes)
     ratios = [_ratio(load(take), take.seed) for take in takes]
-    yield Row("live.wrong_ids_ratio", float(np.mean(ratios)), float(np.std(ratios)), len(ratios))
+    yield mean_row("live.wrong_ids_ratio", ratios)
 
 
 def _ratio(recorded: Recorded, seed: int) -> float:
@@ -503,7 +503,7 @@ def wrong_ids(events: Iterable[Event], ids: Iterable[int], rng: np.random.Genera
 
 
 def mirrored(landmark_map: LandmarkMap) -> LandmarkMap:
-    """The map as it is seen from below."""
+    """The map as it is seen from below: the sign of y changed, markers upright as before."""
     flip = np.diag([1.0, -1.0, 1.0])
     landmarks = {
         i: dataclasses.replace(m, position=flip @ m.position, rotation=flip @ m.rotation @ np.diag([-1.0, 1.0, 1.0]))

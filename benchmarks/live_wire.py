@@ -25,18 +25,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.common import SAMPLES, Row, main
+from benchmarks.common import SAMPLES, Row, main, stamp_of
+from benchmarks.ros_peer import cpu_s
 from fgloc.config import load_config
 from fgloc.live.wire.participant import Participant, Sample
 from fgloc.runner import run
 from fgloc.types import FloatArray, IntArray
 
 _NAMES = ("first_run", "installed_run")
-_TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _PATIENCE_S = 30.0
 _IMAGES = "/camera/image/compressed"  # of the bundled recordings
 _OTHERS = 2  # processes beside, on a machine of two cores
@@ -73,24 +72,19 @@ class _Recorder:
 
     def _on_pose(self, sample: Sample) -> None:
         message = self._messages.decode(sample.message_type, sample.cdr)
-        position, stamp_ns = message.pose.pose.position, _stamp_ns(message)
+        position, stamp_ns = message.pose.pose.position, stamp_of(message.header)
         self.poses.append((stamp_ns, position.x, position.y))
         self.pose_sent_ns[stamp_ns] = sample.source_ns
 
     def _on_image(self, sample: Sample) -> None:
         now = time.time_ns()
-        self.images_ns[_stamp_ns(self._messages.decode(sample.message_type, sample.cdr))] = now
+        self.images_ns[stamp_of(self._messages.decode(sample.message_type, sample.cdr).header)] = now
 
     @property
     def latencies_ms(self) -> FloatArray:
         """Time [ms] from an image to the pose of its exposure, for each image that has one."""
         both = self.images_ns.keys() & self.pose_sent_ns.keys()
         return np.array([(self.pose_sent_ns[stamp] - self.images_ns[stamp]) * 1e-6 for stamp in sorted(both)])
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def live_run(sample: Path, domain: int, rate: float = 1.0) -> Heard:
@@ -131,16 +125,9 @@ def _share_while_publishing(pid: int, play: subprocess.Popen[bytes], recorder: _
     deadline = time.monotonic() + _PATIENCE_S
     while not recorder.sent_ns and time.monotonic() < deadline:
         time.sleep(0.05)
-    began, used = time.monotonic(), _cpu_s(pid)
+    began, used = time.monotonic(), cpu_s(pid)
     play.wait()
-    return (_cpu_s(pid) - used) / (time.monotonic() - began)
-
-
-def _cpu_s(pid: int) -> float:
-    """Processor time so far of a process and those that it has started, of all their threads."""
-    fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
-    started = " ".join(path.read_text("utf-8") for path in Path(f"/proc/{pid}/task").glob("*/children")).split()
-    return (int(fields[11]) + int(fields[12])) * _TICK_S + sum(_cpu_s(int(child)) for child in started)
+    return (cpu_s(pid) - used) / (time.monotonic() - began)
 
 
 @contextmanager

@@ -34,24 +34,21 @@ import argparse
 import hashlib
 import math
 import os
-import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
-from functools import cache
-from itertools import groupby
+from operator import attrgetter
 from typing import Any, Self
 
 import numpy as np
 
-from benchmarks.common import ROOT, Row, main, not_run
+from benchmarks.common import ROOT, Row, main, mean_row, not_run, ratio_row
 from benchmarks.installed import CASES as INSTALLED_CASES
 from benchmarks.installed import Cell as InstalledCell
 from benchmarks.installed import scores_of
 from benchmarks.mechanisms_off import BY_NAME, JOIN, MECHANISMS, Mechanism, together, watched
 from benchmarks.recordings import MRCLAM, SEEDS, Floor, Recorded, Split, Take, changed, folder, load, prepare, robot
-from benchmarks.replays import FAILURES, Replayed, failure, floor, kept, parallel, replayed
+from benchmarks.replays import FAILURES, Replayed, by_recording, failure, floor, kept, parallel, replayed
 from benchmarks.scores import Errors, Scores, errors, lost_share, named, slips
 from fgloc.ablation.failures import MovedMarker
 from fgloc.config import Config
@@ -88,6 +85,7 @@ _NAMED_KINDS = {"frozen", "left_wheel_dead", "right_wheel_dead"}
 _LEAST_M = 0.03  # of a slip
 _ATE, _NEES, _POSES = 1.05, 0.05, 0.99
 _BAND = (math.log(0.7), math.log(1.4))
+_SCORING = tuple(ROOT / "benchmarks" / f"{name}.py" for name in ("mechanisms", "mechanisms_off"))
 _SHOWN = 4  # changes of a mechanism, each way
 
 
@@ -251,32 +249,22 @@ def nees_between(result: RunResult, config: Config, span_ns: tuple[int, int]) ->
 def run_all(cells: Iterable[Cell], jobs: int) -> dict[Cell, Outcome]:
     """Outcomes of all cells, from the cache or run now; a process keeps to one recording at a time."""
     ordered = sorted(set(cells), key=lambda cell: (str(cell.source), cell.case, cell.off))
-    groups = [list(group) for _, group in groupby(ordered, key=lambda cell: cell.source)]
-    found: dict[Cell, Outcome] = {}
-    began = time.monotonic()
-    for done in parallel(_run_group, groups, jobs):
-        found.update(done)
-        print(f"{len(found)} of {len(ordered)} cells, {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
-    return found
-
-
-def _run_group(cells: Sequence[Cell]) -> dict[Cell, Outcome]:
-    return {cell: outcome(cell) for cell in cells}
+    return by_recording(outcome, ordered, attrgetter("source"), jobs)
 
 
 def outcome(cell: Cell) -> Outcome:
     """Figures of one cell; of mechanisms that do not act, those of the run with all of them on."""
     if not cell.off:
-        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell))))
+        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell)), *_SCORING))
     alone = [BY_NAME[name] for name in cell.off.split(JOIN)]
     if all(m.probe for m in alone):
         on = outcome(Cell(cell.source, cell.case))
         if not any(on.acted.get(m.name) for m in alone):
             return on
     if len(alone) == 1:
-        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell))))
+        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell)), *_SCORING))
     with mechanism_of(cell.off).off():
-        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(Cell(cell.source, cell.case)))))
+        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(Cell(cell.source, cell.case))), *_SCORING))
 
 
 def mechanism_of(off: str) -> Mechanism:
@@ -284,17 +272,11 @@ def mechanism_of(off: str) -> Mechanism:
     return BY_NAME[off] if JOIN not in off else together([BY_NAME[name] for name in off.split(JOIN)])
 
 
-@cache
-def _scoring() -> str:
-    names = ("mechanisms.py", "mechanisms_off.py")
-    return hashlib.sha256(b"".join((ROOT / "benchmarks" / name).read_bytes() for name in names)).hexdigest()[:8]
-
-
 def file_name(cell: Cell) -> str:
-    """Name of the file that keeps a cell's outcome, by what is measured and the sources that do so."""
+    """Name of the file that keeps a cell's outcome, by what is measured."""
     where = f"robot{cell.source}" if isinstance(cell.source, int) else folder(cell.source)
     off = hashlib.sha256(cell.off.encode()).hexdigest()[:8] if JOIN in cell.off else cell.off
-    return f"mechanisms_{off or 'on'}_{cell.case}_{where}_{_scoring()}"
+    return f"mechanisms_{off or 'on'}_{cell.case}_{where}"
 
 
 # --- Effects ----------------------------------------------------------------------------------------------------------
@@ -524,7 +506,7 @@ def mean(row_id: str, values: Sequence[float], unit: str = "") -> Row:
     """Mean and standard deviation over the runs."""
     if not values:
         return Row(row_id, None, n=0, reason="nothing was run")
-    return Row(row_id, float(np.mean(values)), float(np.std(values)), len(values), unit)
+    return mean_row(row_id, values, unit)
 
 
 def failed(row_id: str, outcomes: Sequence[Outcome]) -> Row:
@@ -538,8 +520,7 @@ def ratio(row_id: str, off: Sequence[Outcome], on: Sequence[Outcome], mode: str,
     missing = [o for o in (*off, *on) if o.failed or getattr(o, mode) is None]
     if missing:
         return failed(row_id, [*off, *on])
-    a, b = (np.array([getattr(getattr(o, mode), figure) for o in of_all]) for of_all in (off, on))
-    return Row(row_id, float(a.mean() / b.mean()), float(np.std(a / b)), len(a))
+    return ratio_row(row_id, *([getattr(getattr(o, mode), figure) for o in of_all] for of_all in (off, on)))
 
 
 # --- The table for the reader -----------------------------------------------------------------------------------------
@@ -683,7 +664,7 @@ def rules66(chosen: Scope, cases: Sequence[str], jobs: int) -> Iterator[Row]:
         if len(pairs) < len(scores) or not np.isfinite(theirs).all():
             yield Row(_rules_id(case), None, n=len(scores), reason="a pose was not found in every run")
         else:
-            yield Row(_rules_id(case), float(theirs.mean() / ours.mean()), float(np.std(theirs / ours)), len(scores))
+            yield ratio_row(_rules_id(case), theirs, ours)
 
 
 def _plain(cell: InstalledCell) -> tuple[InstalledCell, Scores]:

@@ -8,21 +8,22 @@ set for all five. Values are means over the robots, spreads their standard devia
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from benchmarks import stills
-from benchmarks.common import DATA, MODELS, SAMPLES, Row, main, not_run
+from benchmarks.common import DATA, SAMPLES, Row, main, not_run
+from benchmarks.field_sheet import MODES
+from benchmarks.recordings import MRCLAM, converted
 from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
 from fgloc.calibration.installation import with_settings
-from fgloc.config import Config, config_of, config_of_file, load_config
+from fgloc.config import Config, config_of_file, load_config
 from fgloc.evaluation.metrics import compute_metrics
 from fgloc.recording.reader import open_recording
-from fgloc.recording.storage import find_beside
 from fgloc.runner import RunResult, run
 from fgloc.sensors.equipment import LandmarkSensor
 from fgloc.sensors.maps import load_map
@@ -43,56 +44,37 @@ _BAD_SPEED = 2.0  # m/s: twice the gate's bound on this robot; a keyframe that m
 
 def measure(quick: bool) -> Iterator[Row]:
     """Yield every row; a quick run takes one robot of MRCLAM."""
-    yield from _with_data("mrclam6", _mrclam_ids(), lambda folder: _mrclam(folder, (3,) if quick else range(1, 6)))
-    names = ("duarte", "pinto1")
-    yield from _with_data("pioneer_aruco", [f"pioneer.{n}.ate_rmse_m" for n in names], lambda f: _pioneer(f, names))
-    yield from _with_data("turtlebot3", ["turtlebot3.residual_median_m"], _turtlebot3)
+    if MRCLAM.is_dir():
+        yield from _mrclam((3,) if quick else mrclam.ROBOTS)
+    else:
+        ids = [f"mrclam.{mode}.{key}" for mode in MODES for key in _MRCLAM_UNITS]
+        yield from not_run(ids, f"no {MRCLAM}; set FGLOC_REAL_DATA")
+    turtlebot3 = DATA / "turtlebot3"
+    if turtlebot3.is_dir():
+        yield from _turtlebot3(turtlebot3)
+    else:
+        yield from not_run(["turtlebot3.residual_median_m"], f"no {turtlebot3}; set FGLOC_REAL_DATA")
     yield from stills.measure(quick)
     yield from _sample()
 
 
-def _with_data(name: str, ids: list[str], rows: Callable[[Path], Iterable[Row]]) -> Iterable[Row]:
-    folder = DATA / name
-    return rows(folder) if folder.is_dir() else not_run(ids, f"no {folder}; set FGLOC_REAL_DATA")
-
-
-def _mrclam_ids() -> list[str]:
-    return [f"mrclam.{mode}.{key}" for mode in ("batch", "online") for key in _MRCLAM_UNITS]
-
-
-def _mrclam(folder: Path, robots: Iterable[int]) -> Iterator[Row]:
+def _mrclam(robots: Iterable[int]) -> Iterator[Row]:
     found: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as scratch:
         for robot in robots:
-            bag = mrclam.convert(folder, robot, Path(scratch) / f"robot{robot}")
-            config = _configured(bag, {"motion": {"model": MODELS / f"without_robot{robot}.safetensors"}})
-            for mode in ("batch", "online"):
-                metrics = compute_metrics(run(bag, find_beside(bag, "map.yaml"), config, mode), config)  # type: ignore[arg-type]
+            bag, map_path, config = converted(robot, Path(scratch))
+            for mode in MODES:
+                metrics = compute_metrics(run(bag, map_path, config, mode), config)
                 for key in _MRCLAM_UNITS:
                     found.setdefault(f"mrclam.{mode}.{key}", []).append(getattr(metrics, key))
     for name, values in found.items():
         yield Row(name, float(np.mean(values)), float(np.std(values)), len(values), _MRCLAM_UNITS[name.split(".")[-1]])
 
 
-def _pioneer(folder: Path, names: Iterable[str]) -> Iterator[Row]:
-    """Rows of fgloc and of wheel odometry on the bags themselves, with what `fgloc init` writes.
-
-    Evaluation places the tracked body on the robot for both, so that both are judged alike.
-    """
-    for name in names:
-        bag = folder / f"{name}.bag"
-        config = _initial(bag)
-        ours = compute_metrics(run(bag, None, config, "batch"), config)
-        blind = _configured(bag, {"recording": {"topics": {"sightings": "none"}}}, config)
-        wheels = compute_metrics(run(bag, None, blind, "online"), blind)
-        yield Row(f"pioneer.{name}.ate_rmse_m", ours.ate_rmse_m, unit="m")
-        yield Row(f"pioneer.{name}.odometry.ate_rmse_m", wheels.ate_rmse_m, unit="m")
-
-
 def _turtlebot3(folder: Path) -> Iterator[Row]:
     """Rows of a bag of others with its own map, with what `fgloc init` writes and what the run itself finds."""
     bag, map_path = folder / "rosbag2_2025_11_25-15_11_34", folder / "landmarks_2025_real.yaml"
-    config = _initial(bag)
+    config = config_of_file(yaml.safe_load(first_settings(bag).text))
     result = run(bag, map_path, config, "batch")
     assert result.found is not None
     medians = _residual_medians(bag, with_settings(config, result.found.settings), map_path, result)
@@ -103,11 +85,6 @@ def _turtlebot3(folder: Path) -> Iterator[Row]:
     speeds = np.hypot(*np.diff(poses[:, :2], axis=0).T) / seconds
     wrong = int((~np.isfinite(poses).all(axis=1)).sum() + (speeds > _BAD_SPEED).sum())
     yield Row("turtlebot3.accepted_spikes", wrong, n=len(poses))
-
-
-def _initial(bag: Path) -> Config:
-    """Settings that `fgloc init` writes for a bag."""
-    return config_of_file(yaml.safe_load(first_settings(bag).text))
 
 
 def _residual_medians(bag: Path, config: Config, map_path: Path, result: RunResult) -> dict[int, float]:
@@ -136,29 +113,11 @@ def _residual_medians(bag: Path, config: Config, map_path: Path, result: RunResu
 
 def _sample() -> Iterator[Row]:
     bag = _SAMPLE / "bag"
-    config = _configured(bag, {})
-    for mode in ("batch", "online"):
-        metrics = compute_metrics(run(bag, find_beside(bag, "map.yaml"), config, mode), config)  # type: ignore[arg-type]
+    config = load_config(_SAMPLE / "robot.yaml")
+    for mode in MODES:
+        metrics = compute_metrics(run(bag, _SAMPLE / "map.yaml", config, mode), config)
         yield Row(f"sample.{mode}.ate_mean_m", metrics.ate_mean_m, unit="m")
         yield Row(f"sample.{mode}.nees_over_3", metrics.nees_over_3)
-
-
-def _configured(bag: Path, changes: dict[str, dict[str, object]], base: Config | None = None) -> Config:
-    """The configuration beside the bag (or another) with some values changed."""
-    path = find_beside(bag, "robot.yaml")
-    if base is None and path is None:
-        raise FileNotFoundError(f"no robot.yaml beside {bag}")
-    settings = (base or load_config(path)).model_dump()  # type: ignore[arg-type]
-    _merge(settings, changes)
-    return config_of(settings)
-
-
-def _merge(settings: dict, changes: dict) -> None:  # type: ignore[type-arg]
-    for key, value in changes.items():
-        if isinstance(value, dict) and key != "stamp_offset_s":  # that one is replaced whole
-            _merge(settings[key], value)
-        else:
-            settings[key] = value
 
 
 if __name__ == "__main__":

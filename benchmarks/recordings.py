@@ -15,7 +15,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -81,11 +81,11 @@ class Recorded:
     landmarks: LandmarkMap
     events: tuple[Event, ...]
     start_ns: int  # receive time of the first message
-    slip_s: FloatArray  # (n,) stamps of the truth of slip, seconds from the start
-    slipping: NDArray[np.bool_]  # (n,) whether a wheel slips, by the simulator
-    slip: FloatArray  # (n, 3) true minus wheels' twist: forward, sideways [m/s], turn [rad/s]
     truth: FloatArray  # (m, 4) seconds from the start, x, y, yaw
     duration_s: float
+    slip_s: FloatArray = field(default_factory=lambda: np.zeros(0))  # (n,) of the truth of slip, from the start
+    slipping: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (n,) by the simulator
+    slip: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) true minus wheels' twist [m/s, rad/s]
     camera: Camera | None = None  # as in the recording
     installed: Mapping[str, Any] | None = None  # where it is not what is written: the truth
 
@@ -224,7 +224,6 @@ def robot(number: int) -> Recorded:
         start_ns = recording.span_ns[0]
         until_ns = start_ns + round(_ROBOTS_S * 1e9)
         events = tuple(e for e in recording.events() if e.received_ns < until_ns)
-    none = np.zeros((0, 3))
     return Recorded(
         name=f"mrclam/robot{number}",
         bag=bag,
@@ -233,9 +232,6 @@ def robot(number: int) -> Recorded:
         landmarks=load_map(map_path),
         events=events,
         start_ns=start_ns,
-        slip_s=none[:, 0],
-        slipping=none[:, 0] > 0,
-        slip=none,
         truth=truth_of(events, start_ns),
         duration_s=_ROBOTS_S,
     )

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -27,13 +27,13 @@ from pydantic import TypeAdapter
 
 from benchmarks.common import ROOT
 from benchmarks.recordings import Floor, Recorded, cache_folder, moved_interval
-from fgloc.ablation.failures import AnyFailure, Kidnap, Lift, corrupt, generators
+from fgloc.ablation.failures import AnyFailure, Corruption, Kidnap, Lift
 from fgloc.config import Config
 from fgloc.errors import EstimatorError
 from fgloc.estimation.localizer import Localizer
 from fgloc.files.atomic import atomic_file
 from fgloc.runner import RunResult, protections, run
-from fgloc.sensors.failures import Failure, Scene
+from fgloc.sensors.failures import Failure
 from fgloc.sensors.maps import write_map
 from fgloc.sensors.markers.images import CornersEvent
 from fgloc.sensors.range_bearing import RangeBearingEvent
@@ -140,8 +140,7 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
     Raises:
         FglocError: the configuration does not fit the recording.
     """
-    ids = tuple(sorted(recorded.landmarks.landmarks))
-    scenes = [Scene(recorded.start_ns, recorded.duration_s, config, ids, rng) for rng in generators(len(chain), seed)]
+    failing = Corruption(chain, (recorded.start_ns, recorded.duration_s), config, recorded.landmarks, seed)
     estimates: list[Estimate] = []
     steps: list[Step] = []
     given: list[Event] = []
@@ -158,9 +157,7 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
             yield event
 
     with tempfile.TemporaryDirectory() as folder:
-        map_path, landmarks = recorded.map_path, recorded.landmarks
-        for failure, scene in zip(chain, scenes, strict=True):
-            landmarks = failure.corrupt_map(landmarks, scene)
+        map_path, landmarks = recorded.map_path, failing.corrupt_map(recorded.landmarks)
         if landmarks is not recorded.landmarks:
             map_path = Path(folder) / "map.yaml"
             write_map(landmarks, map_path)
@@ -171,8 +168,8 @@ def replayed(recorded: Recorded, config: Config, chain: Sequence[Failure], seed:
                 config,
                 "batch" if batch else "online",
                 on_step=note,
-                events=lambda _: corrupt(chain, "recorded", iter(recorded.events), scenes),
-                sightings=lambda events: keep(corrupt(chain, "sightings", events, scenes)),
+                events=lambda _: failing.recorded(iter(recorded.events)),
+                sightings=lambda events: keep(failing.sightings(events)),
             )
         except EstimatorError:
             if estimates:
@@ -233,9 +230,9 @@ def moved_id(recorded: Recorded) -> int:
 # --- Figures that are kept --------------------------------------------------------------------------------------------
 
 
-def kept(name: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Result of a cell: from the cache, or made now and put there."""
-    path = cache_folder() / "installed" / f"{name}_{_sources()}.json"
+def kept(name: str, make: Callable[[], Mapping[str, Any]], *sources: Path) -> Mapping[str, Any]:
+    """Result of a cell: from the cache, or made now and put there; ``sources``: others that it depends on."""
+    path = cache_folder() / "installed" / f"{name}_{_sources(sources)}.json"
     if path.is_file():
         return dict(json.loads(path.read_text(encoding="utf-8")))
     began = time.monotonic()
@@ -252,10 +249,10 @@ def kept(name: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 @cache
-def _sources() -> str:
+def _sources(others: tuple[Path, ...]) -> str:
     made = hashlib.sha256()
     package = sorted(p for p in (ROOT / "fgloc").rglob("*") if p.suffix in (".py", ".safetensors"))
-    for path in [*package, *(ROOT / "benchmarks" / f"{name}.py" for name in _SCORING)]:
+    for path in [*package, *(ROOT / "benchmarks" / f"{name}.py" for name in _SCORING), *others]:
         made.update(path.relative_to(ROOT).as_posix().encode())
         made.update(path.read_bytes())
     return made.hexdigest()[:12]
@@ -269,6 +266,27 @@ def parallel(work: Callable[[Any], Any], items: Sequence[Any], jobs: int) -> Ite
     with ProcessPoolExecutor(min(jobs, len(items)), get_context("spawn")) as pool:
         for job in as_completed([pool.submit(work, item) for item in items]):
             yield job.result()
+
+
+def by_recording(
+    work: Callable[[Any], Any], cells: Sequence[Any], recording: Callable[[Any], Any], jobs: int
+) -> dict[Any, Any]:
+    """Results of the work by cell; a process keeps to the cells of one recording at a time."""
+    groups: dict[Any, list[Any]] = {}
+    for cell in cells:
+        groups.setdefault(recording(cell), []).append(cell)
+    found: dict[Any, Any] = {}
+    began = time.monotonic()
+    for done in parallel(partial(_each, work), list(groups.values()), jobs):
+        found.update(done)
+        gone = time.monotonic() - began
+        left = gone * (len(cells) / len(found) - 1.0)
+        print(f"{len(found)} of {len(cells)} cells, {gone:.0f} s, {left:.0f} s left", file=sys.stderr, flush=True)
+    return found
+
+
+def _each(work: Callable[[Any], Any], cells: Sequence[Any]) -> dict[Any, Any]:
+    return {cell: work(cell) for cell in cells}
 
 
 @contextmanager

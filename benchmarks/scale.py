@@ -33,7 +33,7 @@ import numpy as np
 from benchmarks.common import ROOT, SAMPLES, Row, main
 from benchmarks.steps import Chain, World
 from fgloc import se2
-from fgloc.graph.batch import BatchSmoother, elimination_order, initial_values, solved, with_deep_stack
+from fgloc.graph.batch import BatchSmoother, elimination_order, solved, values_at, with_deep_stack
 from fgloc.graph.factors import INSTALLATION, LandmarkFactors, pose_key, sighting_factors
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 
@@ -156,7 +156,7 @@ def _bare(solver: BatchSmoother, factors: LandmarkFactors) -> dict[str, float]:
     In its own order of elimination, and in fgloc's.
     """
     frames, poses, theta = solver.frames, solver.poses(), solver.installed().mean
-    values = initial_values(frames, solver.accepted, factors)
+    values = values_at(frames, [frame.belief.pose for frame in frames], solver.accepted, factors)
     graph = gtsam.NonlinearFactorGraph()
     added_s = _added(graph, solver.factors_of_motion())
     prior = factors.installation.prior()

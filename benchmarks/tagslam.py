@@ -19,7 +19,7 @@ import yaml
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from benchmarks.common import DATA, Row, main, not_run
+from benchmarks.common import DATA, Row, main, not_run, stamp_of
 from fgloc.config import load_config
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
@@ -77,7 +77,7 @@ def _reference(bag: Path) -> tuple[dict[int, FloatArray], FloatArray, FloatArray
                     parents[one.child_frame_id] = one.header.frame_id, T
             else:
                 pose = message.pose.pose
-                stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+                stamps.append(stamp_of(message.header))
                 places.append(_matrix(pose.position, pose.orientation)[:3, 3])
     tags = {}
     for name in parents:

@@ -96,20 +96,10 @@ class WheelsConfig(Section):
     zero_speed: float = expert(0.0, ge=0, le=10, description="a lower speed is rest")
     zero_yaw_rate: float = expert(0.0, ge=0, le=10, description="a lower rate is rest")
     noise: NoiseDensity = NoiseDensity()
-    scale_sigma: float = Field(
-        0.01,
-        ge=0,
-        le=0.5,
-        description="sigma of both radii together",
-    )
+    scale_sigma: float = Field(0.01, ge=0, le=0.5, description="sigma of both radii together")
     turn_scale_sigma: float = Field(0.01, ge=0, le=0.5, description="sigma of the track")
     time_offset_sigma_s: float = expert(0.005, ge=0, le=1.0, description="sigma of the clock")
-    yaw_per_m_sigma: float = expert(
-        0.015,
-        ge=0,
-        le=1,
-        description="sigma of yaw_per_m",
-    )
+    yaw_per_m_sigma: float = expert(0.015, ge=0, le=1, description="sigma of yaw_per_m")
     slowdown_sigma: float = expert(0.0, ge=0, le=5.0, description="sigma of slowdown")
     delay_sigma_s: float = expert(0.0, ge=0, le=1.0, description="sigma of delay_s")
 
@@ -181,18 +171,9 @@ class CameraConfig(Section):
     focal_sigma: float = expert(0.003, ge=0, le=0.5, description="sigma of the focal length, as a share")
     principal_sigma_px: float = expert(2.0, ge=0, le=100.0, description="sigma of the principal point")
     distortion_sigma: float = expert(0.005, ge=0, le=0.5, description="sigma of k1 and k2")
-    time_offset_sigma_s: float = expert(
-        0.012,
-        ge=0,
-        le=1.0,
-        description="sigma of its clock",
-    )
+    time_offset_sigma_s: float = expert(0.012, ge=0, le=1.0, description="sigma of its clock")
     time_jitter_s: float = constant(
-        0.002,
-        "jitter of a driver that stamps on arrival",
-        ge=0,
-        le=0.1,
-        description="sigma of each stamp",
+        0.002, "jitter of a driver that stamps on arrival", ge=0, le=0.1, description="sigma of each stamp"
     )
 
 
@@ -229,10 +210,7 @@ class LandmarksConfig(Section):
     position_sigma_m: float = expert(0.0, ge=0, le=1.0, description="sigma of the mounting, ahead and to the left")
     time_offset_sigma_s: float = expert(0.012, ge=0, le=1.0, description="sigma of the sensor's clock")
     yaw_sigma_rad: float | None = expert(
-        None,
-        ge=1e-5,
-        le=3.2,
-        description="noise of a marker pose's yaw; None: yaw is not used",
+        None, ge=1e-5, le=3.2, description="noise of a marker pose's yaw; None: yaw is not used"
     )
     cauchy_k: float = expert(
         3.0, ge=0.01, le=1e6, description="sigmas: Cauchy kernel, on unknown maps and in fits of a pose"
@@ -244,12 +222,7 @@ class LandmarksConfig(Section):
         le=1_000_000,
         description="sightings that an unknown landmark needs before it is used",
     )
-    repeat_s: float = expert(
-        0.0,
-        ge=0,
-        le=1e6,
-        description="correlation time of a landmark's errors; not of corners",
-    )
+    repeat_s: float = expert(0.0, ge=0, le=1e6, description="correlation time of a landmark's errors; not of corners")
 
 
 class MarkersConfig(Section):
@@ -258,12 +231,7 @@ class MarkersConfig(Section):
     dictionary: str | None = Field(None, description="OpenCV's name, as DICT_4X4_50; None: the map's")
     default_size_m: float | None = Field(None, ge=1e-3, le=5.0, description="side, where the map gives none")
     sigma_px: float = Field(0.5, ge=1e-3, le=100, description="noise of one corner coordinate")
-    blur_s: float = expert(
-        2e-4,
-        ge=0,
-        le=0.1,
-        description="a corner's error is the image's motion in this time",
-    )
+    blur_s: float = expert(2e-4, ge=0, le=0.1, description="a corner's error is the image's motion in this time")
     sway_rad: float = constant(
         0.005,
         "between 0.0005 and 0.015 nothing changes",
@@ -316,8 +284,7 @@ class MotionConfig(Section):
     """The learned motion model."""
 
     model: Annotated[Path | None, BeforeValidator(model_path)] = Field(
-        None,
-        description="file of `fgloc train`, or shipped:sim/diff_drive",
+        None, description="file of `fgloc train`, or shipped:sim/diff_drive"
     )
     use: bool = expert(True, description="false: the model is not used")
     scale: float = expert(1.0, ge=0.01, le=100, description="this robot's distance over the model's")
@@ -536,9 +503,7 @@ class RecordingConfig(Section):
         {}, max_length=100, description="joints in messages of other types (docs/drives.md)"
     )
     odometries: tuple[OdometryTopic, ...] = Field(
-        (),
-        max_length=8,
-        description="beside the wheels: name, topic, pose of each (docs/odometries.md)",
+        (), max_length=8, description="beside the wheels: name, topic, pose of each (docs/odometries.md)"
     )
     received_stamps: tuple[_KnownRole, ...] = Field(
         (), description="roles with receive times in place of header stamps"
@@ -558,8 +523,7 @@ class RecordingConfig(Section):
         None, description="sensor in the base frame, x forward: x y z [m] roll pitch yaw [rad]; None: tf"
     )
     sightings_axes: Literal["body", "optical"] | None = Field(
-        None,
-        description="of what it measures: body (x forward), optical (z forward); None: optical of cameras",
+        None, description="of what it measures: body (x forward), optical (z forward); None: optical of cameras"
     )
     imu_pose: tuple[_Place, _Place, _Place, _Place, _Place, _Place] | None = Field(
         None, description="IMU, likewise; None: tf"

@@ -6,6 +6,7 @@ Those of one sensor are in its module: `fgloc.sensors.gyro.ImuBias`, for example
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import reduce
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from fgloc.config import Config
 from fgloc.frames import rpy_matrix
 from fgloc.sensors import registry
 from fgloc.sensors.base import Joiner
@@ -433,3 +435,47 @@ def corrupt(
 def generators(count: int, seed: int) -> list[np.random.Generator]:
     """One generator per failure of a chain: what one draws does not depend on the others."""
     return [np.random.default_rng([seed, index]) for index in range(count)]
+
+
+class Corruption:
+    """Effects of a chain of failures on one run: on its map first, then on its events at either stage."""
+
+    def __init__(
+        self,
+        failures: Sequence[Failure],
+        span: tuple[int, float],
+        config: Config,
+        landmark_map: LandmarkMap | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Draw nothing yet.
+
+        Args:
+            failures: in the order in which they act.
+            span: receive time of the recording's first message [ns], and its length [s].
+            config: of the run.
+            landmark_map: its map; None: there is none.
+            seed: of what is random.
+        """
+        ids = () if landmark_map is None else tuple(sorted(landmark_map.landmarks))
+        self._failures = failures
+        self._scenes = [Scene(*span, config, ids, rng) for rng in generators(len(failures), seed)]
+
+    def corrupt_map(self, landmark_map: LandmarkMap) -> LandmarkMap:
+        """The map after all failures, itself where none changes it; to be called before the events are."""
+        for failure, scene in zip(self._failures, self._scenes, strict=True):
+            landmark_map = failure.corrupt_map(landmark_map, scene)
+        return landmark_map
+
+    def recorded(self, events: Iterator[Event]) -> Iterator[Event]:
+        """Recorded events after the failures of that stage."""
+        return corrupt(self._failures, "recorded", events, self._scenes)
+
+    def sightings(self, events: Iterator[Event]) -> Iterator[Event]:
+        """Events with markers found in images, after the failures of that stage."""
+        return corrupt(self._failures, "sightings", events, self._scenes)
+
+    @property
+    def affected(self) -> Counter[str]:
+        """Events that the failures changed, dropped or added, by kind."""
+        return sum((scene.affected for scene in self._scenes), Counter())

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -22,7 +21,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 import fgloc
-from fgloc.ablation.failures import corrupt, generators
+from fgloc.ablation.failures import Corruption
 from fgloc.ablation.suite import Cell
 from fgloc.config import Config, files_of
 from fgloc.errors import FglocError, OutputError, RecordingError
@@ -34,7 +33,6 @@ from fgloc.recording.truth import base_pose
 from fgloc.runner import RunResult, run
 from fgloc.sensor_setup import recorded_setup, resolved
 from fgloc.sensors.base import with_values
-from fgloc.sensors.failures import Scene
 from fgloc.sensors.maps import configured_map, write_map
 from fgloc.sensors.markers.images import ImageError, ImageEvent
 from fgloc.sensors.registry import events_by_sensor, streams_of
@@ -299,31 +297,27 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
     cell = job.cell
     config = resolved(cell.config, cell.map)
     with open_recording(cell.bag, config.recording) as recording:
-        start_ns, duration_s = recording.span_ns[0], recording.duration_s
+        span = recording.span_ns[0], recording.duration_s
         sensors = _sensors(recording)
     landmark_map = configured_map(cell.map, config) if cell.map is not None else None
-    ids = () if landmark_map is None else tuple(sorted(landmark_map.landmarks))
-    scenes = [Scene(start_ns, duration_s, config, ids, rng) for rng in generators(len(cell.chain), cell.seed)]
+    failing = Corruption(cell.chain, span, config, landmark_map, cell.seed)
     if cell.start == "truth":
         config = start_at_truth(cell.bag, config)
     plain = job.folder is not None and not cell.chain  # in a sweep all runs of a recording have one set-up
     with tempfile.TemporaryDirectory(prefix="fgloc-") as folder:
         map_file = cell.map
-        if landmark_map is not None:
-            corrupted = landmark_map
-            for failure, scene in zip(cell.chain, scenes, strict=True):
-                corrupted = failure.corrupt_map(corrupted, scene)
-            if corrupted is not landmark_map:
-                map_file = Path(folder) / "map.yaml"
-                write_map(corrupted, map_file)
-                config = with_values(config, "map", {"scale": 1.0, "size_scale": 1.0})  # it is in metres
+        corrupted = None if landmark_map is None else failing.corrupt_map(landmark_map)
+        if corrupted is not None and corrupted is not landmark_map:
+            map_file = Path(folder) / "map.yaml"
+            write_map(corrupted, map_file)
+            config = with_values(config, "map", {"scale": 1.0, "size_scale": 1.0})  # it is in metres
         result = run(
             cell.bag,
             map_file,
             config,
             cell.mode,
-            events=None if plain else lambda events: corrupt(cell.chain, "recorded", events, scenes),
-            sightings=None if plain else lambda events: corrupt(cell.chain, "sightings", events, scenes),
+            events=None if plain else failing.recorded,
+            sightings=None if plain else failing.sightings,
             detections=detections_path(out, job) if job.folder is None else None,
         )
     config = result.config or config
@@ -333,15 +327,12 @@ def _localise(job: Job, out: Path) -> dict[str, Any]:
         owner.unlink(missing_ok=True)  # the files may be those of a run with other settings
         write_results(result, config, out / job.folder, job.command, sha256_of(cell.bag))
         write_text(owner, job.key)
-    affected: Counter[str] = Counter()
-    for scene in scenes:
-        affected.update(scene.affected)
     return {
         "figures": metrics.model_dump(mode="json", exclude=_COSTS),
         "modes": {mode.value: sum(m is mode for m in result.modes) / len(result.modes) for mode in Mode},
         "mistakes": result.mistakes,
         "sensors": sensors,
-        "affected": affected,
+        "affected": failing.affected,
         "track": _track(result, config),
     }
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgloc.cli.options import Bag, ModelOption, configured, need
-from fgloc.cli.terminal import EXIT_LOST, columns, run_bar, say, say_remark
+from fgloc.cli.terminal import UNTRUSTED, columns, exit_if_wrong, run_bar, say
 from fgloc.errors import ConfigError, FglocError
 from fgloc.instrumentation import repeated
 
@@ -238,11 +238,7 @@ def _exit_if_wrong(node: Node) -> None:
         wrong.append("LOST: the pose is not known")
     if status.stale:
         wrong.append(status.stale)
-    for text in wrong:
-        say_remark("error", text, err=True)
-    if wrong:
-        say("not to be trusted, for the reason that is named first", err=True)
-        raise typer.Exit(EXIT_LOST)
+    exit_if_wrong(wrong, UNTRUSTED)
 
 
 def _summary(node: Node, seconds: float) -> str:

@@ -21,9 +21,9 @@ from fgloc.cli.options import (
     warn_of_several_robots,
 )
 from fgloc.cli.terminal import (
-    EXIT_LOST,
     ask,
     asks,
+    exit_if_wrong,
     exit_unless_trusted,
     next_step,
     run_bar,
@@ -186,10 +186,7 @@ def make_map(
         found = survey(bags, settings, given, distances, progress)
     write_map(found.landmarks, out)
     _tell(found, out)
-    if found.errors:
-        for text in found.errors:
-            say_remark("error", text, err=True)
-        raise typer.Exit(EXIT_LOST)
+    exit_if_wrong(found.errors)
     _tell_next(bags, out, config)
 
 
@@ -361,11 +358,8 @@ def calibrate(
     rows = [(s.name, setting_unit(s.name), given_text(s), found_text(s)) for s in settings]
     say_table(("setting", "unit", "given", "found"), rows)
     say(f"configuration: {out}")
-    if wrong := _bending(bags, map_file, before, after, {s.name for s in settings}):
-        for text in wrong:
-            say_remark("error", text, err=True)
-        say("not to be trusted: what is wrong there was fitted by the constants above; correct it first", err=True)
-        raise typer.Exit(EXIT_LOST)
+    wrong = _bending(bags, map_file, before, after, {s.name for s in settings})
+    exit_if_wrong(wrong, "not to be trusted: what is wrong there was fitted by the constants above; correct it first")
     if len(bags) == 1 and only_truth(bags[0], before):
         text = "the noise is that of the wheels within one drive; they differ more from drive to drive: give several"
         say_remark("note", text)

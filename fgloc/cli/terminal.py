@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 EXIT_BAD_INPUT = 1
 EXIT_LOST = 3
 EXIT_INTERRUPTED = 130
+UNTRUSTED = "not to be trusted, for the reason that is named first"
 _MAPPED = "none: landmarks that are seen are estimated with the trajectory"
 
 
@@ -70,9 +71,19 @@ def exit_unless_trusted(result: RunResult, metrics: Metrics | None = None) -> No
     if lost:
         say(f"LOST for {lost} of {len(result.modes)} poses: do not trust them", err=True)
     if _is_wrong(result, metrics):
-        say("not to be trusted, for the reason that is named first", err=True)
+        say(UNTRUSTED, err=True)
     if code := exit_code(result, metrics):
         raise typer.Exit(code)
+
+
+def exit_if_wrong(errors: Sequence[str], verdict: str = "") -> None:
+    """End with code 3 if there are errors, each of them said, and then what they mean."""
+    for text in errors:
+        say_remark("error", text, err=True)
+    if errors:
+        if verdict:
+            say(verdict, err=True)
+        raise typer.Exit(EXIT_LOST)
 
 
 @contextmanager

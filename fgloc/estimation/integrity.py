@@ -24,7 +24,7 @@ from scipy.special import ndtr, ndtri
 from fgloc.config import IntegrityConfig
 from fgloc.estimation.landmark_modes import LandmarkModes, posterior
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import innovation, joint_cov
+from fgloc.graph.joint import innovation
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.observation import Lines
 from fgloc.sensors.measurements import sensor_name
@@ -104,7 +104,7 @@ class Fix:
         Returns:
             Probability after the sightings, mean ``(3,)`` and added covariance ``(3, 3)`` of the error.
         """
-        P = joint_cov(self.predicted, self.known)
+        P = self.predicted.joint_cov(self.known)
         found = innovation(P, self.lines)
         H = found.H[:, :3]
         cross, before = found.H @ P[:, :3], P[:3, :3]

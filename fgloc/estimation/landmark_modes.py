@@ -23,7 +23,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import MOST_STEPS, innovation, joint_cov, transition
+from fgloc.graph.joint import MOST_STEPS, innovation, transition
 from fgloc.graph.measurement_log import LoggedSighting, PoseWithCovariance
 from fgloc.graph.noise import repetition, sighting_whitening
 from fgloc.graph.observation import Lines, Observations
@@ -465,7 +465,7 @@ class LandmarkModes:
             self._take(predicted, belief, [s.measurement for s in fused], lines)
             self._in_place.update(s.alone.landmark_id for s in seen)
             self._fused_ns = fused[0].measurement.stamp_ns
-        P = joint_cov(belief, self._known(belief)) if against else np.zeros((0, 0))
+        P = belief.joint_cov(self._known(belief)) if against else np.zeros((0, 0))
         for m in (s.alone for s in against):
             if self.excludes(m.landmark_id):
                 self._weigh_return(P, belief, m)
@@ -499,7 +499,7 @@ class LandmarkModes:
         if not off.any():
             return belief
         known = self._known(belief)
-        pose, P = se2.compose(belief.pose, se2.exp(off[:3])), joint_cov(belief, known) + spread
+        pose, P = se2.compose(belief.pose, se2.exp(off[:3])), belief.joint_cov(known) + spread
         return PoseWithCovariance.jointly(pose, known.mean + off[3:], P)
 
     def exclude_if_moved(self, landmark_id: int, moved: FloatArray, evidence: float) -> bool:
@@ -543,7 +543,7 @@ class LandmarkModes:
             there = np.concatenate([se2.log(se2.between(predicted.pose, belief.pose)), theta - known.mean])
         if lines.behind.any():
             return
-        P = joint_cov(predicted, known)
+        P = predicted.joint_cov(known)
         found = innovation(P, lines)
         G, parts, own = -(found.H @ self._M), lines.parts, by_displacement(found.H, pose)
         for m, part in zip(seen, parts, strict=True):

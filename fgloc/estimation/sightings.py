@@ -34,7 +34,7 @@ from fgloc.estimation.unnamed import Naming, contradictions
 from fgloc.graph.estimators import Estimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
+from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, nis_of_each
 from fgloc.graph.measurement_log import LoggedSighting, PoseWithCovariance
 from fgloc.graph.noise import repetition
 from fgloc.graph.observation import Lines
@@ -258,7 +258,7 @@ class Association:
             return []
         known = predicted.installation or self._factors.estimated
         lines = self._factors.observe(measurements).together(predicted.pose, known.mean)
-        found = nis_of_each(innovation(joint_cov(predicted, known), lines), lines)
+        found = nis_of_each(innovation(predicted.joint_cov(known), lines), lines)
         uncertain = not is_linear(predicted)
         judged = []
         for m, dof, behind, nis in zip(measurements, lines.dofs, lines.behind, found, strict=True):
@@ -340,7 +340,7 @@ class Association:
             return math.inf, []
         belief, theirs = corrected[0], corrected[0].installation
         lines = self._factors.observe([measurements[i] for i in others]).together(belief.pose, theirs.mean)
-        found = nis_of_each(innovation(joint_cov(belief, theirs), lines), lines)
+        found = nis_of_each(innovation(belief.joint_cov(theirs), lines), lines)
         ratios = {
             i: math.inf if behind else nis / self._gate(dof)
             for i, dof, behind, nis in zip(others, lines.dofs, lines.behind, found, strict=True)

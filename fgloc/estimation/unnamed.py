@@ -28,7 +28,7 @@ from fgloc.estimation.beacons import CARRIED, WRONG_LANDMARK, Track
 from fgloc.estimation.pose_fit import MAX_SIGMA, apart
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate
-from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, joint_cov, nis_of_each
+from fgloc.graph.joint import MOST_JOINT, correct, innovation, is_linear, nis_of_each
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.sensors.measurements import PointMeasurement
 from fgloc.stats import chi2_bound
@@ -152,7 +152,7 @@ class Naming:
                 continue
             spans.append(slice(len(as_if), len(as_if) + len(near)))
             as_if += [replace(m, landmark_id=i) for i in near]
-        P = joint_cov(belief, known)
+        P = belief.joint_cov(known)
         nis: list[float] = []
         if as_if:
             lines = self._factors.observe(as_if).together(belief.pose, known.mean)

@@ -6,9 +6,10 @@ import math
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TypeAlias, TypeVar
 
 import gtsam
@@ -21,6 +22,7 @@ from fgloc.graph.batch_factors import BatchMotions, BatchSightings, GroundMotion
 from fgloc.graph.factors import (
     INSTALLATION,
     LandmarkFactors,
+    factor_graph,
     ground_key,
     landmark_key,
     pose_key,
@@ -55,13 +57,6 @@ def with_deep_stack(work: Callable[[], _T]) -> _T:
             return pool.submit(work).result()
     finally:
         threading.stack_size(before)
-
-
-def initial_values(
-    frames: list[Keyframe], accepted: Mapping[int, tuple[LoggedSighting, ...]], factors: LandmarkFactors
-) -> gtsam.Values:
-    """Initial values of the batch: poses, landmarks and installation as the incremental estimator has them."""
-    return values_at(frames, [frame.belief.pose for frame in frames], accepted, factors)
 
 
 def dead_reckoned(frames: Sequence[Keyframe]) -> list[FloatArray]:
@@ -308,7 +303,7 @@ class BatchSmoother:
             self._sightings = BatchSightings(self.frames, list(self.accepted.values()), factors)
         # With landmarks as variables GTSAM's own order has the smaller cliques
         self._order = elimination_order(self.frames, factors.installation.constants) if factors.known else None
-        self._values = initial_values(self.frames, self.accepted, self._factors)
+        self._values = values_at(self.frames, [frame.belief.pose for frame in self.frames], self.accepted, factors)
         self._solved: Solved | None = None  # covariances of the last solution
         if not factors.known:
             self._begin_at_best()
@@ -399,7 +394,7 @@ class BatchSmoother:
         Corners count by their own noise alone, ranges with the logarithm of the noise that they got on the way to their
         keyframe; a sighting that is left out counts as the least that would be rejected.
         """
-        total = float(self._of_motion().error(self._values)) + self._cost_of_installation()
+        total = float(factor_graph(self.factors_of_motion()).error(self._values)) + self._cost_of_installation()
         if self._sightings is None:
             for frame in self.frames:
                 kept = self.accepted[frame.k]
@@ -544,15 +539,12 @@ class BatchSmoother:
         return before, cost, True
 
     def _linearized(self) -> gtsam.NonlinearFactorGraph:
-        graph = self._of_motion()
+        seen: Iterable[gtsam.NonlinearFactor]
         if self._sightings is None:
-            for sighting in (s for held in self.accepted.values() for s in held):
-                if sighting.factor is not None:
-                    graph.add(sighting.factor)
-            return graph
-        for factor in self._sightings.factors(self._whole_poses(), self._theta(), self._values):
-            graph.add(factor)
-        return graph
+            seen = [s.factor for held in self.accepted.values() for s in held if s.factor is not None]
+        else:
+            seen = self._sightings.factors(self._whole_poses(), self._theta(), self._values)
+        return factor_graph(chain(self.factors_of_motion(), seen))
 
     def factors_of_motion(self) -> Iterator[gtsam.NonlinearFactor]:
         """Priors of poses, and motions linear about the solution."""
@@ -561,12 +553,6 @@ class BatchSmoother:
             yield from self._motions.factors(self.poses())
         if self._on_ground is not None:
             yield from self._on_ground.factors(self.poses(), self._ground(), self._theta())
-
-    def _of_motion(self) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in self.factors_of_motion():
-            graph.add(factor)
-        return graph
 
     def _priors(self) -> Iterator[gtsam.NonlinearFactor]:
         """Priors of the poses and, without sightings of a known map, of the installation."""

@@ -17,6 +17,7 @@ from fgloc.errors import ConfigError, EstimatorError
 from fgloc.graph.factors import (
     INSTALLATION,
     LandmarkFactors,
+    factor_graph,
     ground_key,
     installed_motion_factor,
     installed_prior_factor,
@@ -30,7 +31,7 @@ from fgloc.graph.factors import (
 )
 from fgloc.graph.ground import ground_factors, ground_prior, is_level_known, levelled, predict, starting, step_of
 from fgloc.graph.installation import GROUND, VACANT_SIGMA, Installation, InstallationEstimate, installation_of
-from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear, joint_cov
+from fgloc.graph.joint import EXACT, conditioned, considered, correct, is_linear
 from fgloc.graph.measurement_log import Keyframe, LoggedSighting, MeasurementLog, PoseWithCovariance, Remounting
 from fgloc.sensors.equipment import MotionSensors, PoseSensors
 from fgloc.sensors.learned.sensor import gains_of
@@ -51,6 +52,8 @@ class Estimator(ABC):
         factors: makes the factors of landmarks; it has what is known of the installation.
         log: every measurement of the window (or of the run, if ``keep_all``).
         belief: the newest pose.
+        k: index of the newest keyframe, -1 before the first.
+        elapsed_s: the estimator's own time: runs on through clock jumps.
         rebuilt: how often what the estimator held had to be built again from the log.
         contradicted: constants that left the gate of their prior, with value and sigma that they had then. They are
             held at what was given from then on, and their prior's uncertainty stays in the covariance of the pose.
@@ -62,16 +65,11 @@ class Estimator(ABC):
         self.log = MeasurementLog(config.lag_s, keep_all or config.kind == "isam2")
         self.rebuilt = 0
         self.belief: PoseWithCovariance | None = None
-        self._k = -1
+        self.k = -1
         self._corrected = -1  # the keyframe that was corrected last: those before it lead elsewhere
-        self._elapsed_s = 0.0
+        self.elapsed_s = 0.0
         self.contradicted: dict[str, tuple[float, float]] = {}
         self._last_seen: dict[int, None] = {}  # landmarks of a map that has more than can be states, in this order
-
-    @property
-    def elapsed_s(self) -> float:
-        """The estimator's own time: runs on through clock jumps."""
-        return self._elapsed_s
 
     @property
     def installation(self) -> Installation:
@@ -84,14 +82,9 @@ class Estimator(ABC):
         return self.factors.estimated
 
     @property
-    def k(self) -> int:
-        """Index of the newest keyframe, -1 before the first."""
-        return self._k
-
-    @property
     def newest(self) -> Keyframe:
         """The newest keyframe."""
-        return self.log.keyframes[self._k]
+        return self.log.keyframes[self.k]
 
     def smoothed(self, k: int) -> FloatArray | None:
         """Pose ``(3,)`` of a keyframe as it is estimated now; None: it has left the window."""
@@ -101,9 +94,9 @@ class Estimator(ABC):
         self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LoggedSighting] = ()
     ) -> PoseWithCovariance:
         """Begin a segment: a first pose with a prior, unconnected to what was before."""
-        self._k += 1
-        self._elapsed_s += 1e-3
-        frame = Keyframe(self._k, stamp_ns, self._elapsed_s, prior, prior=prior, sightings=tuple(sightings))
+        self.k += 1
+        self.elapsed_s += 1e-3
+        frame = Keyframe(self.k, stamp_ns, self.elapsed_s, prior, prior=prior, sightings=tuple(sightings))
         return self._take(frame)
 
     def predict(self, motions: Sequence[MotionMeasurement]) -> PoseWithCovariance:
@@ -160,10 +153,10 @@ class Estimator(ABC):
             predicted: result of `predict` for these motions, if the caller has it already.
         """
         predicted = predicted or self.predict(motions)
-        self._k += 1
-        self._elapsed_s += max(dt, 1e-6)
+        self.k += 1
+        self.elapsed_s += max(dt, 1e-6)
         frame = Keyframe(
-            self._k, stamp_ns, self._elapsed_s, predicted, None, tuple(motions), tuple(sightings), tuple(rejected)
+            self.k, stamp_ns, self.elapsed_s, predicted, None, tuple(motions), tuple(sightings), tuple(rejected)
         )
         return self._take(frame)
 
@@ -186,7 +179,7 @@ class Estimator(ABC):
                 frame.sightings = tuple(s for s in frame.sightings if s.measurement.landmark_id != landmark_id)
                 frame.rejected = (*frame.rejected, *of_it)
         newest = self.newest
-        newest.belief, self._corrected = belief, self._k
+        newest.belief, self._corrected = belief, self.k
         self._begin_at(newest)
         self._adopt(newest.belief)
 
@@ -230,7 +223,7 @@ class Estimator(ABC):
         for name in [self.installation.names[i] for i in rows]:
             self.contradicted.pop(name, None)
         newest = self.newest
-        newest.belief, self._corrected = self.loosened(belief, kind, now), self._k
+        newest.belief, self._corrected = self.loosened(belief, kind, now), self.k
         self._begin_at(newest)
         self._adopt(newest.belief)
 
@@ -281,7 +274,7 @@ class Estimator(ABC):
         self.factors.states_changed()
         newest.belief = self._forgetful(_wider(newest.belief, self.installed, added), rows)
         if gone or added.stop > added.start:
-            self._corrected = self._k
+            self._corrected = self.k
             self.factors.estimated = newest.belief.installation or self.installed
             self._begin_at(newest)
         else:
@@ -366,7 +359,7 @@ class Estimator(ABC):
             return belief
         rows, prior = self._held(), self.installation.prior()
         held = [i - 3 for i in rows]
-        P = considered(joint_cov(belief, belief.installation), rows, prior.cov[np.ix_(held, held)])
+        P = considered(belief.joint_cov(belief.installation), rows, prior.cov[np.ix_(held, held)])
         belief.installation.mean[held] = prior.mean[held]
         return PoseWithCovariance.jointly(belief.pose, belief.installation.mean, P)
 
@@ -377,7 +370,7 @@ class Estimator(ABC):
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """The motions of these keyframes (in order) have changed: filter anew from the first of them on."""
-        for k in range(max(changed[0], self._corrected + 1), self._k + 1):
+        for k in range(max(changed[0], self._corrected + 1), self.k + 1):
             before, frame = self.log.keyframes.get(k - 1), self.log.keyframes[k]
             if before is None or frame.prior is not None:
                 continue
@@ -443,7 +436,7 @@ class ExtendedKalmanFilter(Estimator):
         """The belief with what is held as it was given, and nothing uncertain about it."""
         if not self.contradicted:
             return belief
-        rows, P, prior = self._held(), joint_cov(belief, known), self.installation.prior()
+        rows, P, prior = self._held(), belief.joint_cov(known), self.installation.prior()
         gap = np.array([prior.mean[i - 3] - known.mean[i - 3] for i in rows])
         shift = np.linalg.solve(P[np.ix_(rows, rows)], P[rows]).T @ gap
         pose = se2.compose(belief.pose, se2.exp(shift[:3]))
@@ -645,7 +638,7 @@ class IncrementalEstimator(Estimator):
         belief = self._found(k)
         while self._hold_beyond_gate(belief):
             assert self._backend is not None
-            self._backend.swap(self._holding(), [])
+            self._backend.swap(factor_graph([self._holding()]), [])
             belief = self._found(k)
         return self._considered(belief)
 
@@ -657,26 +650,25 @@ class IncrementalEstimator(Estimator):
             raise ValueError("estimate is not finite")
         return belief
 
-    def _holding(self) -> gtsam.NonlinearFactorGraph:
+    def _holding(self) -> gtsam.NonlinearFactor:
         """Factor that holds the constants that left the gate of their prior at the given values."""
-        graph, constants = gtsam.NonlinearFactorGraph(), self.installation.constants
+        constants = self.installation.constants
         rows = [self.installation.index[name] for name in self.contradicted]
         H = np.eye(constants)[rows] / EXACT
         values = gtsam.Values()
         values.insert(INSTALLATION, self.installation.prior().mean[:constants])
-        graph.add(linear_factor({INSTALLATION: H}, np.zeros(len(rows)), values))
-        return graph
+        return linear_factor({INSTALLATION: H}, np.zeros(len(rows)), values)
 
     def _add_prior(self, rows: Sequence[slice]) -> None:
         assert self._backend is not None
-        graph, prior, values = gtsam.NonlinearFactorGraph(), self.installation.prior(), gtsam.Values()
+        made, prior, values = [], self.installation.prior(), gtsam.Values()
         values.insert(INSTALLATION, prior.mean[: self.installation.constants])
         for own in rows:
             more = np.linalg.inv(prior.cov[own, own]) - np.eye(own.stop - own.start) / VACANT_SIGMA**2
             H = np.zeros((len(more), self.installation.constants))
             H[:, own] = np.linalg.cholesky(more).T
-            graph.add(linear_factor({INSTALLATION: H}, np.zeros(len(more)), values))
-        self._backend.swap(graph, [])
+            made.append(linear_factor({INSTALLATION: H}, np.zeros(len(more)), values))
+        self._backend.swap(factor_graph(made), [])
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""
@@ -684,12 +676,9 @@ class IncrementalEstimator(Estimator):
         if backend is None:
             return
         frames = [self.log.keyframes[k] for k in changed if k in self._slots]
-        newest = self.log.keyframes[self._k]
-        graph, slots = gtsam.NonlinearFactorGraph(), []
-        for frame in frames:
-            slots += self._slots[frame.k]
-            for factor in self._motion_factors(frame):
-                graph.add(factor)
+        newest = self.newest
+        graph = factor_graph(factor for frame in frames for factor in self._motion_factors(frame))
+        slots = [slot for frame in frames for slot in self._slots[frame.k]]
         try:
             new = backend.swap(graph, slots) if frames else []
             newest.belief = self._newest(newest.k)
@@ -709,7 +698,7 @@ class IncrementalEstimator(Estimator):
 
     def _build_again(self) -> None:
         """Build a new window from the log as it is now."""
-        newest = self.log.keyframes[self._k]
+        newest = self.newest
         initial = newest.belief
         try:
             newest.belief = self._replayed(self._window(newest) or [newest], initial)
@@ -762,7 +751,7 @@ class IncrementalEstimator(Estimator):
         self, frame: Keyframe, initial: PoseWithCovariance, prior: PoseWithCovariance | None
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Factors and first values of a keyframe; of the first one in a new backend, also of the installation."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        values = gtsam.Values()
         values.insert(pose_key(frame.k), gtsam.Pose2(*initial.pose))
         known = initial.installation or self.installed
         constants = self.installation.constants
@@ -774,13 +763,12 @@ class IncrementalEstimator(Estimator):
         if prior is None:
             made = [*self._motion_factors(frame), *self._ground_factors(frame)]
         elif len(known.mean) and self._fresh:
-            made = installed_prior_factor(frame.k, prior, self._on_ground(frame, self.installed), constants)
+            made = [installed_prior_factor(frame.k, prior, self._on_ground(frame, self.installed), constants)]
         else:
             made = [prior_factor(frame.k, prior.pose, prior.cov)]
             if self.installation.ground:
                 made.append(ground_prior(frame.k, known.mean[constants:], known.cov[constants:, constants:]))
-        if self._fresh and self.contradicted:
-            graph.push_back(self._holding())
+        held = [self._holding()] if self._fresh and self.contradicted else []
         self._fresh = False
         if self.factors.known and frame.sightings:
             measurements = [s.measurement for s in frame.sightings]
@@ -795,9 +783,7 @@ class IncrementalEstimator(Estimator):
         for sighting in frame.sightings:
             self._introduce(sighting.measurement, initial.pose, values)
             made += [] if sighting.factor is None else [sighting.factor]
-        for factor in made:
-            graph.add(factor)
-        return graph, values
+        return factor_graph([*held, *made]), values
 
     def _on_ground(self, frame: Keyframe, known: InstallationEstimate) -> InstallationEstimate:
         """The installation with height, roll and pitch of this keyframe, which may not be the newest."""

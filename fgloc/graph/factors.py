@@ -66,6 +66,14 @@ def linear_factor(
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*pairs, -residual, noise), values)  # type: ignore[call-overload]
 
 
+def factor_graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    """Graph of these factors, in their order."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
 # --- Motions, priors and sightings ------------------------------------------------------------------------------------
 
 # Usual constants, of whitened residuals. Sources: Zhang 1997, "Parameter estimation techniques"; Agarwal et al. 2013,
@@ -121,7 +129,7 @@ def installed_motion_factor(
 
 def installed_prior_factor(
     k: int, prior: PoseWithCovariance, belief: InstallationEstimate, constants: int
-) -> list[gtsam.NonlinearFactor]:
+) -> gtsam.NonlinearFactor:
     """Prior on keyframe k and the installation together; of a prior that knows nothing of it, on each alone.
 
     Of the installation the first ``constants`` are the same for all keyframes, the others are those of this one.
@@ -130,14 +138,9 @@ def installed_prior_factor(
     values = gtsam.Values()
     values.insert(pose_key(k), gtsam.Pose2(*prior.pose))
     insert_installation(k, known.mean, constants, values)
-    n = len(known.mean)
-    cov = np.zeros((3 + n, 3 + n))
-    cov[:3, :3], cov[3:, 3:] = prior.cov, known.cov
-    if prior.cross is not None:
-        cov[:3, 3:], cov[3:, :3] = prior.cross, prior.cross.T
-    W = whitening_of(cov)
+    W = whitening_of(prior.joint_cov(known))
     blocks = {pose_key(k): W[:, :3]} | installation_blocks(k, W[:, 3:], constants)
-    return [linear_factor(blocks, np.zeros(3 + n), values)]
+    return linear_factor(blocks, np.zeros(len(W)), values)
 
 
 def sighting_factors(

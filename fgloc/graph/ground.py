@@ -17,7 +17,7 @@ from fgloc import se2
 from fgloc.frames import rotations
 from fgloc.graph.factors import INSTALLATION, ground_key, linear_factor
 from fgloc.graph.installation import GROUND, Installation, InstallationEstimate
-from fgloc.graph.joint import LINEAR_RAD, as_installed, fuse_installed, joint_cov, predict_on_plane
+from fgloc.graph.joint import LINEAR_RAD, as_installed, fuse_installed, predict_on_plane
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.graph.noise import whitening_of
 from fgloc.sensors.gyro import BIASES, LEVELS, TILTS
@@ -321,7 +321,7 @@ def with_gravity(belief: PoseWithCovariance, seen: Gravity | None, installation:
 def _corrected(belief: PoseWithCovariance, residual: FloatArray, H: FloatArray, cov: FloatArray) -> PoseWithCovariance:
     known = belief.installation
     assert known is not None
-    P = joint_cov(belief, known)
+    P = belief.joint_cov(known)
     gain = np.linalg.solve(H @ P @ H.T + cov, H @ P).T
     moved = -gain @ residual
     P = P - gain @ H @ P

@@ -126,16 +126,6 @@ class Innovation:
     cov: FloatArray
 
 
-def joint_cov(belief: PoseWithCovariance, known: InstallationEstimate) -> FloatArray:
-    """Covariance ``(3 + n, 3 + n)`` of pose and installation."""
-    n = len(known.mean)
-    P = np.zeros((3 + n, 3 + n))
-    P[:3, :3], P[3:, 3:] = belief.cov, known.cov
-    if belief.cross is not None:
-        P[:3, 3:], P[3:, :3] = belief.cross, belief.cross.T
-    return P
-
-
 def innovation(P: FloatArray, lines: Lines) -> Innovation:
     """The innovation of sightings, linearized at the belief whose joint covariance ``P`` is."""
     return Innovation(lines.residual, lines.H, lines.H @ P @ lines.H.T + lines.noise())
@@ -170,7 +160,7 @@ def correct(
         many degrees of freedom as there are residuals); None where it does not converge.
     """
     observed = factors.observe(measurements)
-    P = joint_cov(belief, known)
+    P = belief.joint_cov(known)
     n = len(known.mean)
     x = np.zeros(3 + n)  # tangent of the belief
     pose, theta = belief.pose, known.mean

@@ -31,6 +31,15 @@ class PoseWithCovariance:
         """A pose with an installation of this mean ``(n,)``, and the covariance ``(3 + n, 3 + n)`` of both."""
         return cls(pose, P[:3, :3], P[:3, 3:], InstallationEstimate(mean, P[3:, 3:]))
 
+    def joint_cov(self, known: InstallationEstimate) -> FloatArray:
+        """Covariance ``(3 + n, 3 + n)`` of the pose and an installation: its own, or what is known of it beside."""
+        n = len(known.mean)
+        P = np.zeros((3 + n, 3 + n))
+        P[:3, :3], P[3:, 3:] = self.cov, known.cov
+        if self.cross is not None:
+            P[:3, 3:], P[3:, :3] = self.cross, self.cross.T
+        return P
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedSighting:

@@ -193,18 +193,6 @@ def test_ids_are_unique_and_cells_are_ordered_by_recording():
     assert Cell(Take("found", "patches", "test", 61), "none") < Cell(Take("perfect", "patches", "test", 61), "none")
 
 
-def test_mrclam_rows_are_means_over_the_robots():
-    figures = {"first_pose_s": 1.0, "batch.ate_mean_m": 0.1, "online.ate_mean_m": 0.2}
-    figures |= {"batch.nees_over_3": 1.0, "online.nees_over_3": 1.2}
-    more = {name: 3.0 * value for name, value in figures.items()}
-    made = {r.id: r for r in installed.robot_rows({1: figures, 3: more})}
-    assert set(made) == set(installed.MRCLAM_IDS)
-    assert made["mrclam.first_pose_s"].value == 2.0
-    assert made["mrclam.online.ate_mean_m"].value == pytest.approx(0.4)
-    assert made["mrclam.robot3.batch.nees_over_3"].value == 3.0
-    assert made["mrclam.robot2.batch.nees_over_3"].value is None
-
-
 # --- The textbook -----------------------------------------------------------------------------------------------------
 
 LOOKS_AHEAD = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.25], [0.0, 0.0, 0.0, 1.0]])

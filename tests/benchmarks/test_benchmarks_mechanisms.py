@@ -114,7 +114,7 @@ def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
     on = result(acted={"misread_ids": 0, "doubtful_wheels": 3})
     asked = []
 
-    def kept(name, make):
+    def kept(name, make, *sources):
         asked.append(name)
         return asdict(on if "_on_" in name else result(2.0))
 

@@ -31,7 +31,7 @@ def recorded(slipping=(), seconds=20.0, speed=0.5, events=()):
     slip = np.column_stack([np.where(flag, -0.1, 0.0), np.zeros(len(t)), np.zeros(len(t))])
     truth = np.column_stack([t, speed * t, np.zeros(len(t)), np.zeros(len(t))])
     where = ("made", Path(), Path())
-    return Recorded(*where, Config(), MAP, tuple(events), START_NS, t, flag, slip, truth, seconds)
+    return Recorded(*where, Config(), MAP, tuple(events), START_NS, truth, seconds, t, flag, slip)
 
 
 def decisions(*flagged, step_s=0.2, seconds=20.0, revised=()):
@@ -123,7 +123,7 @@ def test_cells_are_made_once_and_anew_when_a_source_changes(tmp_path, monkeypatc
         return {"value": len(made)}
 
     assert replays.kept("cell", make) == replays.kept("cell", make) == {"value": 1}
-    monkeypatch.setattr(replays, "_sources", lambda: "other")
+    monkeypatch.setattr(replays, "_sources", lambda others: "other")
     assert replays.kept("cell", make) == {"value": 2}
 
 

@@ -31,7 +31,7 @@ from fgloc.graph.estimators import ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import predict
 from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
-from fgloc.graph.joint import correct, fuse_installed, joint_cov
+from fgloc.graph.joint import correct, fuse_installed
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
@@ -135,8 +135,8 @@ def test_prediction_is_that_of_the_dense_joint_gaussian():
     F = np.array([se2.log(se2.between(end(-h * e), end(h * e))) / (2 * h) for e in np.eye(11)]).T
     G = np.vstack([F, np.hstack([np.zeros((5, 3)), np.eye(5), np.zeros((5, 3))])])
     P = np.zeros((11, 11))
-    P[:8, :8], P[8:, 8:] = joint_cov(belief, known), cov
-    assert joint_cov(after, known) == pytest.approx(G @ P @ G.T, rel=1e-3, abs=1e-7)
+    P[:8, :8], P[8:, 8:] = belief.joint_cov(known), cov
+    assert after.joint_cov(known) == pytest.approx(G @ P @ G.T, rel=1e-3, abs=1e-7)
 
 
 def test_fused_motions_depend_on_both_installations():
@@ -158,7 +158,7 @@ def test_correction_is_that_of_the_dense_joint_gaussian():
     seen = [seen_from(truth, i, rng) for i in (0, 1, 3)]
     corrected, cost = correct(belief, known, seen, factors)
     # Gauss-Newton on the whole cost, in information form
-    P, x = joint_cov(belief, known), np.zeros(8)
+    P, x = belief.joint_cov(known), np.zeros(8)
     for _ in range(20):
         pose, theta = se2.compose(belief.pose, se2.exp(x[:3])), known.mean + x[3:]
         H, r = [], []
@@ -172,7 +172,7 @@ def test_correction_is_that_of_the_dense_joint_gaussian():
         x = x - np.linalg.solve(information, np.linalg.solve(P, x) + H.T @ r)
     assert corrected.pose == pytest.approx(se2.compose(belief.pose, se2.exp(x[:3])), abs=2e-5)
     assert corrected.installation.mean == pytest.approx(known.mean + x[3:], abs=2e-5)
-    assert joint_cov(corrected, corrected.installation) == pytest.approx(np.linalg.inv(information), rel=0.01, abs=1e-7)
+    assert corrected.joint_cov(corrected.installation) == pytest.approx(np.linalg.inv(information), rel=0.01, abs=1e-7)
     assert cost == pytest.approx(float(r @ r + x @ np.linalg.solve(P, x)), rel=0.01)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from fgloc.ablation.failures import Kidnap, Lift, Truncated, corrupt, generators
+from fgloc.ablation.failures import Corruption, Kidnap, Lift, Truncated
 from fgloc.ablation.suite import FailureEntry
 from fgloc.config import Config, Role, config_of
 from fgloc.errors import ConfigError, EstimatorError
@@ -31,7 +31,6 @@ from fgloc.files.settings import merged, sentences
 from fgloc.live import Live
 from fgloc.recording.reader import MessageEvents
 from fgloc.sensors.failures import Failure
-from fgloc.sensors.failures import Scene as FailureScene
 from fgloc.sensors.markers.images import CornersEvent, ImageEvent
 from fgloc.types import Event, FloatArray, LandmarkMap, Mode, TruthEvent
 from fgloc_datasets.bag import BagWriter
@@ -69,15 +68,11 @@ class FailingSensors:
                     f"failure '{failure.kind}' changes recordings or what was found in images; while a robot drives "
                     "there are those of its messages: dropout, darkness, latency, encoder_dead, moved_marker, ..."
                 )
-        ids = tuple(sorted(landmarks.landmarks))
-        rngs = generators(len(failures), seed)
-        scenes = [FailureScene(EPOCH_NS, duration_s, config, ids, rng) for rng in rngs]
-        self.landmark_map = landmarks
-        for failure, scene in zip(failures, scenes, strict=True):
-            self.landmark_map = failure.corrupt_map(self.landmark_map, scene)
+        failing = Corruption(failures, (EPOCH_NS, duration_s), config, landmarks, seed)
+        self.landmark_map = failing.corrupt_map(landmarks)
         self._waiting: deque[Event] = deque()
         self._now_ns = 0
-        self._out = corrupt(failures, "recorded", self._arriving(), scenes)
+        self._out = failing.recorded(self._arriving())
 
     def after(self, events: Iterable[Event], now_ns: int) -> Iterator[Event]:
         """Events received up to now, after the failures, and events that were held back until now."""
