@@ -38,9 +38,8 @@ if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext
 
 
-_OPENCV_ORDER = (1, 0, 3, 2)
-_OPENCV_SHIFT_PX = -0.5
-_TAGSLAM_ORDER = (3, 2, 1, 0)  # it begins at the bottom left and goes on to the right
+_APRILTAG_ORDER = (3, 2, 1, 0)  # corners begin at the bottom left of the upright print and go on to the right
+_OPENCV_SHIFT_PX = -0.5  # the AprilTag library has whole pixels at the edges of pixels
 
 
 def from_image(m: Any, when: When) -> Event:
@@ -60,7 +59,7 @@ def from_apriltags(m: Any, when: When) -> Event:
     """Event of a ``apriltag_msgs/AprilTagDetectionArray``."""
     sightings = []
     for tag in m.detections:
-        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_OPENCV_ORDER)] + _OPENCV_SHIFT_PX
+        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_APRILTAG_ORDER)] + _OPENCV_SHIFT_PX
         sightings.append(MarkerCorners(int(tag.id), corners))
     return CornersEvent(*when, m.header.frame_id, tuple(sightings))
 
@@ -69,7 +68,7 @@ def from_tagslam(m: Any, when: When) -> Event:
     """Event of a ``apriltag_msgs/ApriltagArrayStamped``, as TagSLAM's detector nodes publish it."""
     sightings = []
     for tag in m.apriltags:
-        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_TAGSLAM_ORDER)]
+        corners = np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_APRILTAG_ORDER)]
         sightings.append(MarkerCorners(int(tag.id), corners))
     return CornersEvent(*when, m.header.frame_id, tuple(sightings))
 
