@@ -23,6 +23,7 @@ _SHARED = 0.9  # share of a turn that another explains: one measurement
 _GRAVITY = 5.0  # m/s²: less is no accelerometer
 _TILTED_RAD = 0.5  # of gravity from the IMU's upward axis: no careful mounting, and no slope
 _LEANS_RAD = 0.2  # as much, where the gyro about that axis is off by what such a tilt makes it
+_COSINE = 0.02  # share by which that is at least
 _GRAVITY_SIZE = 9.81  # m/s²; 9.78 to 9.83 on Earth
 _GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is off, and beyond which its unit is
 
@@ -196,7 +197,7 @@ def _by_gravity(found: Conventions, path: Path, force: FloatArray, up: FloatArra
     if about is None or about.share < TELLS or about.scale.value <= 0.0:
         check_gravity(found, force, up)
         return fit
-    mistaken = fit.scale.off(1.0, RATE_SCALE) and not about.scale.off(1.0, RATE_SCALE)
+    mistaken = fit.scale.off(1.0, _COSINE) and abs(about.scale.value - 1.0) < 0.5 * abs(fit.scale.value - 1.0)
     tilted = check_gravity(found, force, up, _LEANS_RAD if mistaken else _TILTED_RAD)
     return about if tilted else fit
 
