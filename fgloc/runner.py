@@ -250,7 +250,7 @@ def _meaningless(roles: Collection[Role], parts: Assembly, estimates: Sequence[E
     elif (
         not parts.sensors and parts.config.motion.model is None and {"image", "sightings"}.isdisjoint(base_roles(roles))
     ):
-        whole_s = (estimates[-1].stamp_ns - estimates[0].stamp_ns) * 1e-9
+        whole_s = max((estimates[-1].stamp_ns - estimates[0].stamp_ns) * 1e-9, parts.wheels.unknown_s)
         if parts.wheels.unknown_s > _MOTIONLESS * whole_s:
             yield Finding(
                 "motion.unmeasured",

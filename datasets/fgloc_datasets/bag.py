@@ -200,11 +200,11 @@ class LandmarkMessages(MessageWriter):
     ) -> None:
         """``apriltag_msgs/AprilTagDetectionArray`` of corners (4, 2) [px] by id, clockwise from the top left.
 
-        The message counts from the first pixel's corner and holds the tag upside down (`fgloc.recording.reader`).
+        The message counts from the first pixel's corner, and from the bottom left of the tag to the right.
         """
         detections = []
         for number, given in markers.items():
-            corners = np.asarray(given, dtype=float)[[1, 0, 3, 2]] + 0.5
+            corners = np.asarray(given, dtype=float)[[3, 2, 1, 0]] + 0.5
             centre, *points = (dict(x=float(x), y=float(y)) for x, y in [corners.mean(axis=0), *corners])
             detections.append(dict(id=number, decision_margin=100.0, centre=centre, corners=points))
         kind = "apriltag_msgs/msg/AprilTagDetectionArray"

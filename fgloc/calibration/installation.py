@@ -32,6 +32,7 @@ Found = Mapping[str, tuple[float, float]]
 """Value and sigma by name."""
 
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_ONE_ANGLE = 0.1  # cosine of a camera's pitch below which roll and yaw are nearly one angle (it looks up or down)
 _OF_SIGHTINGS = {"range_scale": 1.0, "bearing_offset_rad": 0.0, "time_offset_s": 0.0, "x_m": 0.0, "y_m": 0.0}  # at 0
 
 
@@ -196,8 +197,11 @@ def _of_camera(state: InstallationState, config: Config, camera: Camera) -> Iter
     place = slice(first, first + 6)
     at_first = mounting(camera, np.zeros(6), state.prior[place, place])
     now = mounting(camera, state.mean[place], state.cov[place, place])
-    for axis in _AXES:
+    turned = camera.T_base_cam[:3, :3] @ state.mean[place][3:]  # about the base's axes
+    for k, axis in enumerate(_AXES):
         (at, prior), (value, sigma) = at_first[f"{block}.{axis}"], now[f"{block}.{axis}"]
+        if k > 2 and math.cos(now[f"{block}.pitch"][0]) < _ONE_ANGLE:
+            at = value - turned[k - 3]  # the given rotation, by angles as near those found as it has
         yield Setting(f"{block}.{axis}", at, value, sigma, prior)
     scale = config.of_camera(camera.name).camera.focal_scale
     found = scale * (1.0 + state.value(f"{block}.focal"))

@@ -50,6 +50,7 @@ def conventions(
     if path is None:
         return found
     found.commanded = path.source == "command"
+    gyro.check_dead(found, path)
     odometry.check_sideways(found, path)
     path = odometry.check_angles(found, path)
     path = gyro.check_wheels(found, path)

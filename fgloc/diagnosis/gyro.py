@@ -18,11 +18,27 @@ from fgloc.frames import homogeneous, rotation_of, sensor_pose
 from fgloc.sensors.wheels.sensor import WRONG_SIDES
 from fgloc.types import FloatArray, Severity
 
+_TURNED_RAD = 0.5  # by the wheels: enough for any gyro to notice
 _SHARED = 0.9  # share of a turn that another explains: one measurement
 _GRAVITY = 5.0  # m/s²: less is no accelerometer
 _TILTED_RAD = 0.5  # of gravity from the IMU's upward axis: no careful mounting, and no slope
+_LEANS_RAD = 0.2  # as much, where the gyro about that axis is off by what such a tilt makes it
+_COSINE = 0.02  # share by which that is at least
 _GRAVITY_SIZE = 9.81  # m/s²; 9.78 to 9.83 on Earth
 _GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is off, and beyond which its unit is
+
+
+def check_dead(found: Conventions, path: Path) -> None:
+    """Name a gyro that gives the same rates from the first message to the last, and leave the IMU out."""
+    rates = found.signals.rates()
+    if rates is None or np.ptp(rates[1], axis=0).any() or np.ptp(path.poses[:, 2]) < _TURNED_RAD:
+        return
+    text = (
+        f"The gyro's rates never change (they are {', '.join(f'{w:g}' for w in rates[1][0])} rad/s), while the wheels "
+        f"turn the robot by up to {math.degrees(np.ptp(path.poses[:, 2])):.0f}°: it does not measure"
+    )
+    found.add("imu.dead", text, {"recording.topics.imu": "none"})
+    found.signals = replace(found.signals, imu=[])
 
 
 def by_odometry(found: Conventions, path: Path) -> RateFit | None:
@@ -132,8 +148,7 @@ def check_gyro(found: Conventions, path: Path) -> RateFit | None:
     configured = found.turn_about(path, up * abs(given))
     gravity = _gravity_axis(force)
     if configured is not None and configured.share > TELLS and configured.scale.value > 0.0:
-        check_gravity(found, force, up * sign)
-        return _check_scale(found, configured)
+        return _check_scale(found, _by_gravity(found, path, force, up * sign, configured))
     if configured is not None and configured.share > TELLS and gravity is not None and gravity @ up * sign > 0.5:
         found.opposite = True  # the IMU stands upright: wheels or gyro count the other way
         return replace(configured, scale=replace(configured.scale, value=-configured.scale.value))
@@ -175,23 +190,36 @@ def _pose_for(up: FloatArray) -> list[float]:
     return [0.0, 0.0, 0.0, *(round(v, 4) + 0.0 for v in sensor_pose(T, optical=False)[3:])]
 
 
+def _by_gravity(found: Conventions, path: Path, force: FloatArray, up: FloatArray, fit: RateFit) -> RateFit:
+    """Name an IMU that is not upright by its accelerometer; the fit of the turn about the axis that is."""
+    axis, given = _gravity_axis(force), abs(found.config.gyro.scale)
+    about = None if axis is None else found.turn_about(path, axis * given)
+    if about is None or about.share < TELLS or about.scale.value <= 0.0:
+        check_gravity(found, force, up)
+        return fit
+    mistaken = fit.scale.off(1.0, _COSINE) and abs(about.scale.value - 1.0) < 0.5 * abs(fit.scale.value - 1.0)
+    tilted = check_gravity(found, force, up, _LEANS_RAD if mistaken else _TILTED_RAD)
+    return about if tilted else fit
+
+
 def _gravity_axis(force: FloatArray) -> FloatArray | None:
     mean = np.median(force, axis=0)
     size = float(np.linalg.norm(mean))
     return None if not size > _GRAVITY else np.asarray(mean / size)
 
 
-def check_gravity(found: Conventions, force: FloatArray, up: FloatArray) -> None:
+def check_gravity(found: Conventions, force: FloatArray, up: FloatArray, least_rad: float = _TILTED_RAD) -> bool:
     """Report an IMU that is not upright by its accelerometer, although its gyro agrees or measures no turn."""
     axis = _gravity_axis(force)
-    if axis is None or math.acos(float(np.clip(axis @ up, -1.0, 1.0))) < _TILTED_RAD:
-        return
+    if axis is None or math.acos(float(np.clip(axis @ up, -1.0, 1.0))) < least_rad:
+        return False
     k, snapped = int(np.argmax(np.abs(axis))), np.zeros(3)
     snapped[k] = math.copysign(1.0, axis[k])
-    if float(axis @ snapped) < math.cos(_TILTED_RAD):
+    if float(axis @ snapped) < math.cos(_TILTED_RAD) or float(up @ snapped) > math.cos(_TILTED_RAD):
         snapped = axis
     text = f"The IMU's accelerometer has gravity along {_named(axis)}, not along the axis that its mounting says"
     found.add("imu.gravity", text, {"recording.imu_pose": _pose_for(snapped)})
+    return True
 
 
 def _named(axis: FloatArray) -> str:

@@ -50,6 +50,7 @@ _MAP_WINDOWS_S = (8.0, 20.0, 50.0)  # over which landmarks are compared with a m
 _COARSE_S = (20.0, 50.0, 120.0, 300.0)  # likewise where one is in view at a time
 _COARSE_MISFIT, _COARSE_OF_THREE = 0.25, 0.1  # of a map so compared; three landmarks fit many maps
 _CLEARLY, _NO_DOUBT = 0.5, 0.05  # of the misfit of all others; misfit by the wheels' drift alone
+_FITS, _IN_PART = 0.1, 0.25  # misfit of a window that a map fits, and share of such windows that no other map has
 _MAP_STEP, _FEWEST_WINDOWS = 0.625, 3  # from window to window, in their widths; of windows with three landmarks
 _STEEPEST = 30.0  # of a prior's cost: its exponential is a number
 _WINDOW_S = (
@@ -446,12 +447,14 @@ class MapFit:
         mirrored: whether the map is a mirror image.
         shift: by how much the ids of the map are higher than those seen; 0 if they agree.
         misfit: robust residual over the spread of the landmarks: small if the map fits.
+        in_part: whether the map as given fits some of the stretches.
     """
 
     scale: Figure
     mirrored: bool
     shift: int
     misfit: float
+    in_part: bool
 
 
 def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, FloatArray]) -> MapFit | None:
@@ -471,15 +474,12 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
         windows = list(_places_seen(path, seen, q, width))
         if sum(len(window) > 2 for window in windows) >= _FEWEST_WINDOWS:
             break
-    best: tuple[float, bool, int, list[float]] | None = None
-    for shift, mirrored in product((0, 1, -1), (False, True)):
-        scales, misfits = _laid_on(windows, places, shift, mirrored)
-        if len(misfits) >= _FEWEST_WINDOWS and (best is None or float(np.median(misfits)) < 0.5 * best[0]):
-            best = (float(np.median(misfits)), mirrored, shift, scales)
+    best = reading_of_map(windows, places)
     if best is None:
         return None
     misfit, mirrored, shift, scales = best
     scale = float(np.median(scales))
+    in_part = _share_within(_laid_on(windows, places, 0, False)[1], _FITS) >= _IN_PART
     # landmarks are off on the map all the time, so that only other landmarks are another sample; of three there is none
     ids = np.array(sorted({i for window in windows for i in window if i + shift in places}))
     left_out = []
@@ -489,7 +489,32 @@ def fit_map(path: Path, seen: Sightings, mounting: Mounting, places: dict[int, F
         if len(part) >= _FEWEST_WINDOWS:
             left_out.append([float(np.median(part))])
     sigma = float(jackknife(np.array(left_out))[0]) if len(left_out) > 2 else scale * max(misfit, _OF_THREE)
-    return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit)
+    return MapFit(Figure(scale, sigma + 1e-3), mirrored, shift, misfit, in_part)
+
+
+def reading_of_map(
+    windows: list[dict[int, complex]], places: dict[int, FloatArray]
+) -> tuple[float, bool, int, list[float]] | None:
+    """Misfit, mirror image, shift of ids and scales of the reading of a map that fits best; None: too few landmarks.
+
+    The map as given stands where some windows fit it as well as most fit another reading: a mistake of the map is in
+    all of them, a robot that was carried, or slipped, spoils those about that time.
+    """
+    best: tuple[float, bool, int, list[float]] | None = None
+    _, as_given = _laid_on(windows, places, 0, False)
+    for shift, mirrored in product((0, 1, -1), (False, True)):
+        scales, misfits = _laid_on(windows, places, shift, mirrored)
+        misfit = float(np.median(misfits)) if len(misfits) >= _FEWEST_WINDOWS else math.inf
+        if misfit < (math.inf if best is None else 0.5 * best[0]) and (
+            best is None or _share_within(as_given, misfit) < _IN_PART
+        ):
+            best = (misfit, mirrored, shift, scales)
+    return best
+
+
+def _share_within(misfits: Sequence[float], most: float) -> float:
+    """Share of windows whose misfit is at most this."""
+    return float(np.mean(np.array(misfits) <= most)) if misfits else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -450,6 +450,13 @@ def _scale(found: Conventions, path: Path, seen: Sightings, m: Mounting) -> None
     by_wheels, places = m.scale, found.places  # true over reported range, in the wheels' metres
     fit = fit_map(path, seen, m, places) if len(places) > 2 else None
     if fit is not None:
+        if fit.misfit >= _NO_MAP and fit.in_part:
+            text = (
+                "The map fits some stretches of the way and not others: the robot was carried or slipped on it, or "
+                "landmarks were moved or bear the same number"
+            )
+            found.add("map.contradiction", text, severity=Severity.WARNING)
+            return
         if fit.misfit >= _NO_MAP:
             text = (
                 "The map contradicts wheels and sightings, which agree, and neither a mirror image nor a scale of it "

@@ -115,3 +115,19 @@ def test_poses_of_markers_on_two_topics_are_of_two_cameras(tmp_path):
     }
     assert config.landmarks.repeat_s > 0.0
     assert config.landmarks.position_sigma_m > Config().landmarks.position_sigma_m
+
+
+def test_commands_with_a_steering_angle_lack_the_wheelbase_alone(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(200):
+            bag.ackermann("/ackermann_cmd", 1_000_000_000 + 50_000_000 * k, 1.0, 0.3 * math.sin(0.05 * k))
+    settings = first_settings(tmp_path / "bag")
+    (lacking,) = [text for text in settings.missing if "wheelbase" in text]
+    assert "steering angle" in lacking
+    lines = settings.text.splitlines()
+    first = lines.index("# wheels:")
+    filled = "\n".join(line.removeprefix("# ") for line in lines[first : first + 5]).replace(
+        "wheelbase:", "wheelbase: 2.8"
+    )
+    wheels = Config.model_validate(yaml.safe_load(filled)).wheels
+    assert (wheels.source, wheels.drive.wheelbase) == ("command", 2.8)

@@ -21,6 +21,7 @@ from fgloc.calibration.installation import (
     with_settings,
 )
 from fgloc.config import Config, config_of, load_config, yaml_of
+from fgloc.frames import OPTICAL_TO_BODY, homogeneous, rpy_matrix
 from fgloc.graph.contradictions import Contradiction, Rival
 from fgloc.graph.installation import Installation, InstallationEstimate
 from fgloc.sensors.cameras import corrected
@@ -92,6 +93,19 @@ def test_the_places_of_the_maps_landmarks_are_among_the_values_found():
     belief = InstallationEstimate(np.array([0.02, -0.03]), np.diag([0.01, 0.02]) ** 2)
     values = found_values(installation, belief, Config(), (), landmark_map)
     assert values == {"map.7.x": pytest.approx((1.02, 0.01)), "map.7.y": pytest.approx((1.97, 0.02))}
+
+
+@pytest.mark.parametrize("pitch", [0.5 * np.pi, -0.5 * np.pi, 0.0])
+def test_a_camera_that_looks_up_or_down_is_off_by_the_angle_that_it_is_turned_by(pitch):
+    """Roll and yaw are one angle there: written as such, a turn by 3 mrad was one of 400 mrad."""
+    K = np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]])
+    T = homogeneous(rpy_matrix(0.0, pitch, 0.0) @ OPTICAL_TO_BODY)
+    names = [f"camera.{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")]
+    turned = {name: (0.003 * name.endswith("rad"), 0.001, 0.01) for name in names}
+    settings = settings_found(found(turned, cameras=(Camera(640, 480, "plumb_bob", K, np.zeros(0), T),)), Config())
+    off = {s.name: s.found - s.given for s in settings if s.name in ("camera.roll", "camera.pitch", "camera.yaw")}
+    assert len(off) == 3
+    assert max(abs(value) for value in off.values()) == pytest.approx(0.003, rel=0.05)
 
 
 def test_a_camera_is_corrected():

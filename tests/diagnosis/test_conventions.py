@@ -162,6 +162,14 @@ def conventions_of(bag: Path, config: Config):
 
 
 COMPARED = ("wheels", "sightings", "imu", "truth", "map", "scales", "motion")
+
+
+def leaning(degrees: float) -> tuple[tuple[float, ...], ...]:
+    """Axes of the base in those of an IMU that is turned about its x axis."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return (1.0, 0.0, 0.0), (0.0, c, s), (0.0, -s, c)
+
+
 CASES = {
     "sightings mirrored (F4)": (Broken(bearing=-1.0), "sightings.mirrored", None),
     "ranges in feet": (Broken(range=1.0 / FOOT), "sightings.scale", FOOT),
@@ -172,6 +180,9 @@ CASES = {
     "IMU x and z exchanged (G2)": (Broken(imu_axes=((0, 0, 1), (0, 1, 0), (1, 0, 0))), "imu.axes", None),
     "IMU in degrees (G3)": (Broken(imu_unit=180.0 / math.pi), "imu.unit", math.pi / 180.0),
     "IMU negated (G4)": (Broken(imu_axes=((-1, 0, 0), (0, -1, 0), (0, 0, -1))), "imu.axes", None),
+    "IMU leans by 45 degrees": (Broken(imu_axes=leaning(45.0)), "imu.gravity", None),
+    "IMU leans by 20 degrees": (Broken(imu_axes=leaning(20.0)), "imu.gravity", None),
+    "gyro without power": (Broken(imu_unit=0.0), "imu.dead", None),
     "IMU late (F6)": (Broken(imu_late=0.35), "clock.imu", 0.35),
     "speeds in mm/s (G8)": (Broken(speed=1000.0), "odometry.twist_unit", 1e-3),
     "twist in the world (G8)": (Broken(world_twist=True), "odometry.twist_frame", None),

@@ -10,7 +10,7 @@ import pytest
 
 from fgloc.config import config_of
 from fgloc.diagnosis.comparison import Conventions
-from fgloc.diagnosis.landmark_fits import Mounting, compared, fit_on_map, fit_sightings
+from fgloc.diagnosis.landmark_fits import Mounting, compared, fit_on_map, fit_sightings, reading_of_map
 from fgloc.diagnosis.landmarks import check_first_pose
 from fgloc.diagnosis.pairs import Figure
 from fgloc.diagnosis.signals import Path, SightingCollector, Sightings, Signals
@@ -117,3 +117,31 @@ def test_a_scale_beyond_any_unit_of_length_is_not_known(factor):
     found = fit_sightings(path_of(), tiny, ["body"])["body"]
     assert found.scale.sigma == found.yaw.sigma == found.late_s.sigma == math.inf
     assert 1e-5 < found.scale.value < 1e5
+
+
+def windows_of(seed: int, shift: int = 0, mirrored: bool = False, carried: bool = False):
+    """Places of four landmarks in each of three windows, and the map; carried: in all but the first, two are off."""
+    rng = np.random.default_rng(seed)
+    places = {i: rng.uniform(-4.0, 4.0, 2) for i in range(9)}
+    windows = []
+    for k in range(3):
+        window = {}
+        for n, i in enumerate(rng.choice(9, 4, replace=False).tolist()):
+            z = complex(*places[i]) + 0.05 * complex(*rng.normal(size=2))
+            z = z.conjugate() if mirrored else z
+            off = 3.0 * np.exp(1j * rng.uniform(0.0, math.tau))
+            window[i - shift] = z + (off if carried and k and n < 2 else 0.0)
+        windows.append(window)
+    return windows, places
+
+
+def test_a_robot_that_is_carried_makes_no_map_a_mirror_image_or_of_other_ids():
+    for seed in range(300):
+        _, mirrored, shift, _ = reading_of_map(*windows_of(seed, carried=True))
+        assert (mirrored, shift) == (False, 0), seed
+
+
+@pytest.mark.parametrize(("shift", "mirrored"), [(1, False), (0, True), (-1, True)])
+def test_a_map_with_a_mistake_is_read_with_it(shift, mirrored):
+    read = [reading_of_map(*windows_of(seed, shift, mirrored)) for seed in range(100)]
+    assert sum((m, s) == (mirrored, shift) for _, m, s, _ in read) >= 99

@@ -139,7 +139,7 @@ def make_pose(bag: BagWriter, x: float):
 def test_apriltag_corners_are_put_in_opencv_order(tmp_path):
     def make(bag, header):
         m = bag.make
-        # As the AprilTag library reports an upright tag that covers pixels 100 to 199
+        # As the AprilTag library (3.4) reports an upright print that covers pixels 100 to 199
         corners = [m("apriltag_msgs/msg/Point", x=x, y=y) for x, y in ((100, 200), (200, 200), (200, 100), (100, 100))]
         tag = m(
             "apriltag_msgs/msg/AprilTagDetection",
@@ -159,7 +159,7 @@ def test_apriltag_corners_are_put_in_opencv_order(tmp_path):
     assert (event.stamp_ns, event.frame_id) == (5_000_000_007, "cam")
     (tag,) = event.sightings
     assert tag.landmark_id == 0
-    expected = [[199.5, 199.5], [99.5, 199.5], [99.5, 99.5], [199.5, 99.5]]  # half a turn, pixel centres whole
+    expected = [[99.5, 99.5], [199.5, 99.5], [199.5, 199.5], [99.5, 199.5]]  # from the top left on, pixel centres whole
     np.testing.assert_array_equal(tag.corners_px, expected)
 
 

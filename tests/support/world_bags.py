@@ -61,7 +61,7 @@ def _tags(bag: BagWriter, stamp: int, tags):
     m = bag.make
     detections = []
     for number, corners in tags:
-        points = [m("apriltag_msgs/msg/Point", x=float(x), y=float(y)) for x, y in corners[[1, 0, 3, 2]] + 0.5]
+        points = [m("apriltag_msgs/msg/Point", x=float(x), y=float(y)) for x, y in corners[[3, 2, 1, 0]] + 0.5]
         x, y = corners.mean(axis=0) + 0.5
         detections.append(
             m(

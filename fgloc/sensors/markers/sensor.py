@@ -39,9 +39,8 @@ if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext
 
 
-_OPENCV_ORDER = (1, 0, 3, 2)
-_OPENCV_SHIFT_PX = -0.5
-_TAGSLAM_ORDER = (3, 2, 1, 0)  # it begins at the bottom left and goes on to the right
+_APRILTAG_ORDER = (3, 2, 1, 0)  # corners begin at the bottom left of the upright print and go on to the right
+_OPENCV_SHIFT_PX = -0.5  # the AprilTag library has whole pixels at the edges of pixels
 
 
 def from_image(m: Any, when: When) -> Event:
@@ -59,17 +58,17 @@ def from_compressed_image(m: Any, when: When) -> Event:
 
 def from_apriltags(m: Any, when: When) -> Event:
     """Event of a ``apriltag_msgs/AprilTagDetectionArray``."""
-    return CornersEvent(*when, m.header.frame_id, _tags(m.detections, _OPENCV_ORDER, _OPENCV_SHIFT_PX))
+    return CornersEvent(*when, m.header.frame_id, _tags(m.detections, _OPENCV_SHIFT_PX))
 
 
 def from_tagslam(m: Any, when: When) -> Event:
     """Event of a ``apriltag_msgs/ApriltagArrayStamped``, as TagSLAM's detector nodes publish it."""
-    return CornersEvent(*when, m.header.frame_id, _tags(m.apriltags, _TAGSLAM_ORDER, 0.0))
+    return CornersEvent(*when, m.header.frame_id, _tags(m.apriltags, 0.0))
 
 
-def _tags(tags: Any, order: Sequence[int], shift_px: float) -> tuple[MarkerCorners, ...]:
-    """Corners of tags, taken in this order and moved by this much to OpenCV's pixels."""
-    corners = (np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(order)] + shift_px for tag in tags)
+def _tags(tags: Any, shift_px: float) -> tuple[MarkerCorners, ...]:
+    """Corners of tags in OpenCV's order, moved by this much to its pixels."""
+    corners = (np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_APRILTAG_ORDER)] + shift_px for tag in tags)
     return tuple(MarkerCorners(int(tag.id), own) for tag, own in zip(tags, corners, strict=True))
 
 

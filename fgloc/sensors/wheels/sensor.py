@@ -281,6 +281,13 @@ def _first_section(look: FirstLook) -> FirstSection:
     """Joints, radii and track, as far as the recording shows them."""
     joints, odometry, commands = look.of(JointsEvent), look.of(OdometryEvent), look.of(ControlEvent)
     names = joint_names(joints)
+    if not names and not odometry and any(command.steering is not None for command in commands):
+        why = "commands give a steering angle, and nothing else measures motion"
+        missing = (
+            f"the wheelbase, since {why}: fill in wheels.drive, which is in the file as a comment (docs/drives.md)"
+        )
+        lines = _drive_to_fill_in(NamedDrive("ackermann", why, ("wheelbase:  # m",)))
+        return FirstSection((*lines, "#   source: command  # commands stand in for wheels"), (missing,))
     if not names:
         return FirstSection()
     pair = wheel_pair(names)
@@ -338,8 +345,8 @@ def _found(pair: WheelPair, geometry: WheelGeometry) -> tuple[str, ...]:
 
 def _drive_to_fill_in(drive: NamedDrive) -> tuple[str, ...]:
     return (
-        f"# By its joints a drive of kind {drive.kind}: {drive.why}.",
-        "# Fill in to use them (all keys: docs/drives.md):",
+        f"# A drive of kind {drive.kind}: {drive.why}.",
+        "# Fill in to use it (all keys: docs/drives.md):",
         "# wheels:",
         "#   drive:",
         f"#     kind: {drive.kind}",
