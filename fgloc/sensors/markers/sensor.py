@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext
 
 
-_APRILTAG_ORDER = (3, 2, 1, 0)  # corners begin at the bottom left of the upright print and go on to the right
+_APRILTAG_ORDER = [3, 2, 1, 0]  # corners begin at the bottom left of the upright print and go on to the right
 _OPENCV_SHIFT_PX = -0.5  # the AprilTag library has whole pixels at the edges of pixels
 
 
@@ -68,7 +68,7 @@ def from_tagslam(m: Any, when: When) -> Event:
 
 def _tags(tags: Any, shift_px: float) -> tuple[MarkerCorners, ...]:
     """Corners of tags in OpenCV's order, moved by this much to its pixels."""
-    corners = (np.array([(c.x, c.y) for c in tag.corners], dtype=float)[list(_APRILTAG_ORDER)] + shift_px for tag in tags)
+    corners = (np.array([(c.x, c.y) for c in tag.corners], dtype=float)[_APRILTAG_ORDER] + shift_px for tag in tags)
     return tuple(MarkerCorners(int(tag.id), own) for tag, own in zip(tags, corners, strict=True))
 
 
