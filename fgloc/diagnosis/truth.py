@@ -193,7 +193,7 @@ def true_body(found: Conventions, path: Path) -> BodyFit | None:
     if len(found.signals.truth) < _FEWEST or path.length_m < 0.3:
         return None
     _frozen(found, path)
-    _jumps(found)
+    _jumps(found, path)
     poses = found.signals.true_poses()
     if poses is None:
         return None
@@ -317,13 +317,18 @@ def _frozen(found: Conventions, path: Path) -> None:
         found.add("truth.frozen", text, None, Figure(share, 0.0), Severity.NOTE)
 
 
-def _jumps(found: Conventions) -> None:
+def _jumps(found: Conventions, path: Path) -> None:
     """Name a truth that jumps: by more, from one message to the next, than it otherwise moves or turns in that time."""
     rows = in_order(found.signals.truth)
     seconds = np.diff(rows[:, 0])
     turned = 2.0 * np.arccos(np.minimum(np.abs((rows[1:, 4:8] * rows[:-1, 4:8]).sum(axis=1)), 1.0))
     moved = np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
-    apart = (moved, _JUMP_M / found.config.truth.scale), (turned, _JUMP_RAD)
+    extents = [
+        np.linalg.norm(np.ptp(np.percentile(places, (5, 95), axis=0), axis=0))
+        for places in (rows[:, 1:3], path.at(rows[:, 0])[:, :2])
+    ]
+    unit = max(float(extents[0]) / max(float(extents[1]), _WIDE_M), 1.0)  # of a truth in millimetres
+    apart = (moved, _JUMP_M * unit), (turned, _JUMP_RAD)
     jumped = np.any([d > slack + 3.0 * np.percentile(d / seconds, 90) * seconds for d, slack in apart], axis=0)
     gap = seconds > found.config.truth.max_gap_s
     jumped &= ~(gap | np.append(False, gap[:-1]))  # what comes first after a gap may be older than its stamp of receipt

@@ -528,6 +528,18 @@ def test_a_truth_that_no_robot_can_have_is_named(tmp_path, kind, code):
     assert not {f.code for f in sound} & {"truth.axes", "truth.jumps", "truth.frozen"}
 
 
+@pytest.mark.parametrize(("jump_mm", "is_named"), [(0.0, False), (1500.0, True)])
+def test_glitches_of_a_truth_in_millimetres_are_no_jumps(jump_mm, is_named):
+    t = np.arange(0.0, 30.0, 0.01)
+    x, still = 0.2 * t, np.zeros(len(t))
+    glitches = 30.0 * (np.random.default_rng(3).random(len(t)) < 0.02)
+    places = 1e3 * x + glitches + jump_mm * (t > 15.0)
+    signals = Signals(truth=list(zip(t, places, still, still, still, still, still, still + 1.0, strict=True)))
+    found = Conventions(Config(), signals)
+    true_body(found, Odometry(t, np.column_stack([x, still, still]), np.zeros(len(t), dtype=np.int64), "odometry"))
+    assert ("truth.jumps" in found.codes) == is_named
+
+
 @pytest.mark.parametrize(("rate", "is_named"), [(0.3, True), (0.01, False)])
 def test_a_yaw_that_hardly_changes_is_not_said_to_be_the_odometrys(rate, is_named):
     t = np.arange(0.0, 30.0, 0.1)

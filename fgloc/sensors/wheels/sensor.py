@@ -609,13 +609,14 @@ def roll_over(motion: Sequence[Event], config: Config) -> tuple[float, int] | No
 
 
 def _jumps(times: FloatArray, angles: FloatArray) -> list[float]:
-    """Difference [rad] of each jump from the steps beside it; none is told by a step over a silence."""
+    """Difference [rad] of each jump from the steps beside it; no jump is what the wheel turns in that time."""
     steps, passed = np.diff(angles), np.diff(times)
-    if len(steps) < 3:
+    if np.count_nonzero(passed > 0.0) < 3:
         return []
     usual = max(_JUMP * float(np.median(np.abs(steps))), _LEAST_JUMP_RAD)
     found = []
-    for k in np.flatnonzero((np.abs(steps) > usual) & (passed < _JUMP * np.median(passed))).tolist():
+    turned = 2.0 * np.quantile(np.abs(steps[passed > 0.0]) / passed[passed > 0.0], 0.9) * passed
+    for k in np.flatnonzero(np.abs(steps) > np.maximum(usual, turned)).tolist():
         beside = [steps[i] for i in (k - 1, k + 1) if 0 <= i < len(steps) and abs(steps[i]) <= usual]
         if beside:
             found.append(abs(float(steps[k] - np.mean(beside))))
