@@ -434,7 +434,7 @@ def _camera(facts: StreamFacts, config: Config) -> Camera:
     if T_base_cam is None:
         T_base_cam = facts.frames.lookup(base_frame(facts, config), frame)
     if config.camera.file is not None:
-        camera = load_camera(config.camera.file, T_base_cam)
+        camera = load_camera(config.camera.file, T_base_cam, topic)
     elif isinstance(info, CameraInfoEvent):
         camera = camera_from_info(info, T_base_cam, size, is_rectified(topic or ""))
     else:

@@ -55,13 +55,13 @@ def camera_from_info(
     return _checked(f"{event.topic} (CameraInfo)", full, model, K, D, T_base_cam, event.frame_id)
 
 
-def load_camera(path: Path, T_base_cam: FloatArray, name: str | None = None) -> Camera:
+def load_camera(path: Path, T_base_cam: FloatArray, topic: str | None = None) -> Camera:
     """Read a calibration file: ROS (camera_calibration), OpenCV (FileStorage YAML) or Kalibr (camchain).
 
     Args:
         path: the file.
         T_base_cam: mounting ``(4, 4)`` of the optical frame.
-        name: camera of a Kalibr file; None: the only one, or cam0.
+        topic: of the images: of several cameras in a Kalibr file the one with this ``rostopic``, else cam0, is meant.
 
     Raises:
         CameraError: the file is none of these, or its calibration cannot be used.
@@ -74,7 +74,7 @@ def load_camera(path: Path, T_base_cam: FloatArray, name: str | None = None) -> 
         return _ros(path, root, T_base_cam)
     cameras = {key: item for key, item in keys.items() if item.is_mapping and item.get("intrinsics") is not None}
     if cameras:
-        return _kalibr(path, cameras, T_base_cam, name)
+        return _kalibr(path, cameras, T_base_cam, topic)
     raise CameraError(
         f"{path}: no calibration in it: expected camera_matrix (ROS, OpenCV) or cam0: intrinsics (Kalibr), "
         f"got the keys {', '.join(keys)}"
@@ -171,10 +171,10 @@ def _opencv(path: Path, root: Item, T_base_cam: FloatArray) -> Camera:
     return _checked(str(path), (width, height), model, K, D, T_base_cam, "")
 
 
-def _kalibr(path: Path, cameras: dict[str, Item], T_base_cam: FloatArray, name: str | None) -> Camera:
-    chosen = name or ("cam0" if "cam0" in cameras else next(iter(cameras)))
-    if chosen not in cameras:
-        raise CameraError(f"{path}: no camera '{chosen}'; there are {', '.join(cameras)}")
+def _kalibr(path: Path, cameras: dict[str, Item], T_base_cam: FloatArray, topic: str | None) -> Camera:
+    topics = {name: item.get("rostopic") for name, item in cameras.items()}
+    own = [name for name, its in topics.items() if its is not None and f"{topic}/".startswith(f"{its.text()}/")]
+    chosen = own[0] if own else "cam0" if "cam0" in cameras else next(iter(cameras))
     item = cameras[chosen]
     kind = item.need("camera_model").text()
     if kind != "pinhole":
@@ -185,9 +185,10 @@ def _kalibr(path: Path, cameras: dict[str, Item], T_base_cam: FloatArray, name: 
     D = np.zeros(0) if coefficients is None else coefficients.numbers()
     width, height = (int(v) for v in item.need("resolution").numbers(2))
     camera = _checked(str(path), (width, height), "" if model is None else model.text(), K, D, T_base_cam, "")
-    if name is None and len(cameras) > 1:
+    if not own and len(cameras) > 1:
         others = ", ".join(k for k in cameras if k != chosen)
-        camera = replace(camera, notes=(*camera.notes, f"{path}: camera {chosen} is used, not {others}."))
+        note = f"{path}: camera {chosen} is used, not {others}: the images' topic is the rostopic of none."
+        camera = replace(camera, notes=(*camera.notes, note))
     return camera
 
 

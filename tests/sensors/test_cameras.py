@@ -186,6 +186,7 @@ cam1:
   distortion_model: equidistant
   distortion_coeffs: [-0.013, 0.009, 0.012, -0.004]
   resolution: [320, 240]
+  rostopic: /cam1/image_raw
 """
 
 
@@ -204,15 +205,16 @@ def test_calibration_files_give_the_same_camera(tmp_path: Path, text: str) -> No
     assert not c.D[4:].any()
 
 
-def test_kalibr_camera_can_be_chosen(tmp_path: Path) -> None:
+def test_the_camera_of_a_kalibr_file_is_that_of_the_images_topic(tmp_path: Path) -> None:
     path = written(tmp_path, KALIBR)
-    first = load_camera(path, T)
-    assert (first.model, first.width) == ("plumb_bob", 640)
-    assert re.search("cam0 .*cam1", first.notes[-1])
-    second = load_camera(path, T, "cam1")
-    assert (second.model, second.width, second.notes) == ("equidistant", 320, ())
-    with pytest.raises(CameraError, match=r"'cam2'.*cam0, cam1"):
-        load_camera(path, T, "cam2")
+    for topic in (None, "/cam10/image_raw"):
+        first = load_camera(path, T, topic)
+        assert (first.model, first.width) == ("plumb_bob", 640)
+        assert re.search("cam0 .*cam1", first.notes[-1])
+    assert load_camera(path, T, "/cam0/image_raw").notes == ()
+    for topic in ("/cam1/image_raw", "/cam1/image_raw/compressed"):
+        second = load_camera(path, T, topic)
+        assert (second.model, second.width, second.notes) == ("equidistant", 320, ())
 
 
 @pytest.mark.parametrize(
