@@ -22,8 +22,8 @@ _TURNED_RAD = 0.5  # by the wheels: enough for any gyro to notice
 _SHARED = 0.9  # share of a turn that another explains: one measurement
 _GRAVITY = 5.0  # m/s²: less is no accelerometer
 _TILTED_RAD = 0.5  # of gravity from the IMU's upward axis: no careful mounting, and no slope
-_LEANS_RAD = 0.2  # as much, where the gyro about that axis is off by what such a tilt makes it
-_COSINE = 0.02  # share by which that is at least
+_LEANS_RAD = 0.2  # the same where the gyro's scale is off too: a lean by an angle makes the rate its cosine
+_COSINE = 0.02  # least such error of the scale: 1 - cos(0.2)
 _GRAVITY_SIZE = 9.81  # m/s²; 9.78 to 9.83 on Earth
 _GRAVITY_OFF, _OTHER_UNIT = 0.02, 0.15  # share beyond which an accelerometer is off, and beyond which its unit is
 

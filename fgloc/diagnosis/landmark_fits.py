@@ -50,7 +50,10 @@ _MAP_WINDOWS_S = (8.0, 20.0, 50.0)  # over which landmarks are compared with a m
 _COARSE_S = (20.0, 50.0, 120.0, 300.0)  # likewise where one is in view at a time
 _COARSE_MISFIT, _COARSE_OF_THREE = 0.25, 0.1  # of a map so compared; three landmarks fit many maps
 _CLEARLY, _NO_DOUBT = 0.5, 0.05  # of the misfit of all others; misfit by the wheels' drift alone
-_FITS, _IN_PART = 0.1, 0.25  # misfit of a window that a map fits, and share of such windows that no other map has
+_FITS, _IN_PART = (
+    0.1,
+    0.25,
+)  # largest misfit of a window that the map fits; share of such windows of one that fits in part
 _MAP_STEP, _FEWEST_WINDOWS = 0.625, 3  # from window to window, in their widths; of windows with three landmarks
 _STEEPEST = 30.0  # of a prior's cost: its exponential is a number
 _WINDOW_S = (
@@ -501,13 +504,13 @@ def reading_of_map(
     all of them, a robot that was carried, or slipped, spoils those about that time.
     """
     best: tuple[float, bool, int, list[float]] | None = None
-    _, as_given = _laid_on(windows, places, 0, False)
-    for shift, mirrored in product((0, 1, -1), (False, True)):
-        scales, misfits = _laid_on(windows, places, shift, mirrored)
-        misfit = float(np.median(misfits)) if len(misfits) >= _FEWEST_WINDOWS else math.inf
-        if misfit < (math.inf if best is None else 0.5 * best[0]) and (
-            best is None or _share_within(as_given, misfit) < _IN_PART
-        ):
+    laid = {by: _laid_on(windows, places, *by) for by in product((0, 1, -1), (False, True))}
+    as_given = laid[0, False][1]
+    for (shift, mirrored), (scales, misfits) in laid.items():
+        if len(misfits) < _FEWEST_WINDOWS:
+            continue
+        misfit = float(np.median(misfits))
+        if best is None or (misfit < 0.5 * best[0] and _share_within(as_given, misfit) < _IN_PART):
             best = (misfit, mirrored, shift, scales)
     return best
 

@@ -72,7 +72,7 @@ _EFFECTS: Mapping[str, Callable[[Sequence[Decision], Trajectory], str]] = {
     "clock_jump": lambda rows, trajectory: "no motion connects the poses before and after",
     "mounting_changed": lambda rows, trajectory: "mounting found again",
 }
-"""What became of the pose by a judgement, in words, by its kind: of its rows, by time, and the run's trajectory."""
+"""Sentence on what a judgement did to the pose, by its kind: made of its rows, by time, and of the trajectory."""
 
 
 def _sigma_m(trajectory: Trajectory, stamp_ns: int, before: bool) -> float:

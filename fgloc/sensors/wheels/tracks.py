@@ -459,9 +459,7 @@ class OdometryTrack(Track):
         self._paths = [0.0, 0.0, 0.0, 0.0]  # pose: m, rad; twist: m, rad
         self._along = 0j  # sum of the pose's motions times the conjugate of the twist's [m²]
         self._across = np.zeros(3)  # sums over these products of |.|², |.|² angle, |.|² angle² [m⁴]
-        self._heading_off = (
-            0.0  # angle from the way to the way by the pose's heading, where the twist is used for it [rad]
-        )
+        self._heading_off = 0.0  # angle [rad] from the motion to the pose's heading, where the twist is used for that
 
     @property
     def by_twist(self) -> bool:
