@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
+from fgloc.frames import yaw_quaternion
 from fgloc.recording.messages import Messages, default_typestore
 from fgloc.recording.standard_messages import Message, header, rotation, xyz
 
@@ -381,6 +382,13 @@ class BagWriter(LandmarkMessages):
         """``geometry_msgs/PoseStamped``; quaternion x, y, z, w."""
         pose = {"position": xyz(*position), "orientation": quaternion_fields(quaternion)}
         self._write(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, received_ns, frame_id, dict(pose=pose))
+
+    def planar_truth(
+        self, topic: str, stamp_ns: int, pose: Sequence[float], received_ns: int | None = None, frame_id: str = "map"
+    ) -> None:
+        """``geometry_msgs/PoseStamped`` of a pose x, y, yaw on the ground."""
+        x, y, yaw = pose
+        self.truth(topic, stamp_ns, (x, y, 0.0), yaw_quaternion(yaw).tolist(), received_ns, frame_id)
 
     def twist(
         self,

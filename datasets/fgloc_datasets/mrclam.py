@@ -38,7 +38,6 @@ from scipy.optimize import least_squares, minimize, nnls
 from fgloc import se2
 from fgloc.config import NoiseDensity
 from fgloc.errors import RecordingError
-from fgloc.frames import yaw_quaternion
 from fgloc.sensors.maps import write_map
 from fgloc.types import FloatArray, IntArray, Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
@@ -263,8 +262,8 @@ def _sightings(bag: BagWriter, run: Run, groups: list[slice]) -> Iterator[Messag
 
 
 def _truth(bag: BagWriter, run: Run) -> Iterator[Message]:
-    for stamp, (x, y, yaw) in zip(run.truth_ns.tolist(), run.truth.tolist(), strict=True):
-        yield stamp, partial(bag.truth, "/truth", stamp, (x, y, 0.0), yaw_quaternion(yaw).tolist())
+    for stamp, pose in zip(run.truth_ns.tolist(), run.truth.tolist(), strict=True):
+        yield stamp, partial(bag.planar_truth, "/truth", stamp, pose)
 
 
 def _rows_in_time(path: Path, columns: int) -> FloatArray:

@@ -1,6 +1,5 @@
 """A sweep: jobs named by their inputs, run once, whole records, nothing lost when processes die."""
 
-import math
 import multiprocessing
 import os
 import shutil
@@ -10,22 +9,18 @@ import sys
 import threading
 import time
 
-import numpy as np
 import psutil
 import pytest
 import yaml
 from attempts import attempts
+from circle_bag import write_circle
 from refusal import refusal
 
-from fgloc import se2
 from fgloc.ablation.jobs import execute, make_jobs, read_record, record_path
 from fgloc.ablation.suite import expand, load_suite
 from fgloc.ablation.sweep import _client, sweep
 from fgloc.errors import ConfigError, RecordingError
-from fgloc_datasets.bag import BagWriter
 
-START_NS = 1_700_000_000_000_000_000
-BEACONS = {0: (3.0, 0.0), 1: (0.0, 3.0), 2: (-3.0, 0.0), 4: (0.0, -3.0)}
 SUITE = {
     "title": "short",
     "recordings": [{"name": "circle", "bag": "bag"}],
@@ -44,35 +39,11 @@ SUITE = {
 }
 
 
-def write_circle(folder, seconds=6.0):
-    """A robot on a circle that sees four beacons, with truth; ``map.yaml`` beside the bag."""
-    rng = np.random.default_rng(3)
-    pose, odometry = np.array([1.0, 0.0, math.pi / 2]), np.zeros(3)
-    with BagWriter(folder / "bag") as bag:
-        for k in range(round(seconds * 20)):
-            stamp = START_NS + k * 50_000_000
-            bag.odometry("/odom", stamp, odometry, (0.4, 0.4))
-            bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
-            if k % 5 == 0:
-                bag.range_bearing("/landmarks", stamp, [sight(rng, pose, i) for i in BEACONS])
-            pose = se2.compose(pose, se2.exp((0.02, 0.0, 0.02)))
-            wobble = rng.normal(0.0, 0.001, 2)
-            odometry = se2.compose(odometry, se2.exp((0.02 + wobble[0], 0.0, 0.02 + wobble[1])))
-    rows = "".join(f"  - {{id: {i}, position: [{x}, {y}]}}\n" for i, (x, y) in BEACONS.items())
-    (folder / "map.yaml").write_text(f"landmarks:\n{rows}")
-
-
-def sight(rng, pose, i):
-    dx, dy = BEACONS[i][0] - pose[0], BEACONS[i][1] - pose[1]
-    distance = math.hypot(dx, dy) + rng.normal(0.0, 0.05)
-    return i, distance, se2.wrap(math.atan2(dy, dx) - pose[2] + rng.normal(0.0, 0.02))
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A bag, its map and a suite."""
     path = tmp_path_factory.mktemp("suite")
-    write_circle(path)
+    write_circle(path, seconds=6.0)
     (path / "suite.yaml").write_text(yaml.safe_dump(SUITE))
     return path
 

@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from robot_world import points
 from rosbags.highlevel import AnyReader
 
 from benchmarks import field_recordings
@@ -16,10 +17,9 @@ from benchmarks.field_peers import Heard, clean, textbook
 from benchmarks.field_recordings import RECORDINGS, Recording
 from benchmarks.field_sheet import SHEET, SOUND, Trap, false_findings, found, right_cause
 from fgloc import se2
-from fgloc.frames import yaw_quaternion
 from fgloc.recording.messages import default_typestore
 from fgloc.sensors.maps import write_map
-from fgloc.types import Landmark, LandmarkMap, Trajectory
+from fgloc.types import Trajectory
 from fgloc_datasets.convert import new_bag
 
 ARM = np.array([0.12, -0.05])
@@ -156,10 +156,8 @@ def _small(_, out):
             pose = (4.0 * math.sin(yaw), 4.0 * (1.0 - math.cos(yaw)), yaw)
             bag.odometry("/odom", t, pose, (2.0, 0.0, 0.5))
             bag.range_bearing("/landmarks", t, [(i, 3.0 + 0.01 * k, 0.2) for i in (1, 2, 3)])
-            bag.truth("/truth", t, (*pose[:2], 0.0), yaw_quaternion(yaw).tolist())
-    write_map(
-        LandmarkMap({i: Landmark(i, np.array([i, 1.0, 0.0]), np.eye(3), 0.0) for i in (1, 2, 3)}), out / "map.yaml"
-    )
+            bag.planar_truth("/truth", t, pose)
+    write_map(points({i: (i, 1.0) for i in (1, 2, 3)}), out / "map.yaml")
 
 
 def _content(bag):

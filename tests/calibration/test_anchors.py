@@ -11,7 +11,6 @@ from fgloc import se2
 from fgloc.calibration.anchors import survey_anchors
 from fgloc.config import config_of, config_of_file, load_config
 from fgloc.errors import ConfigError, RecordingError
-from fgloc.frames import yaw_quaternion
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
 from fgloc_datasets.bag import BagWriter
@@ -50,8 +49,7 @@ def write(folder, rate=eight, wrong=0.0, seldom=(), places=PLACES, steps=STEPS):
                 length = math.dist((*pose[:2], 0.0), places[number]) + rng.normal(0.0, NOISE_M)
                 length += rng.uniform(1.0, 5.0) if rng.random() < wrong else 0.0
                 bag.range_reading("/ranges", stamp, length, f"anchor_{number}")
-            x, y, yaw = se2.compose(TRUTH_FRAME, pose)
-            bag.truth("/truth", stamp, (x, y, 0.0), yaw_quaternion(yaw))
+            bag.planar_truth("/truth", stamp, se2.compose(TRUTH_FRAME, pose))
             poses.append(pose)
             turn = omega * STEP_NS * 1e-9
             way = SPEED * STEP_NS * 1e-9

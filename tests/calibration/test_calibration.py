@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusal import refusal
+from robot_world import points
 from typer.testing import CliRunner
 
 from fgloc import cli, se2
@@ -16,6 +17,7 @@ from fgloc.calibration.installation import found_text, given_text, setting_unit
 from fgloc.config import Config, config_of, load_config, model_path, yaml_of
 from fgloc.errors import EstimatorError
 from fgloc.runner import run
+from fgloc.sensors.maps import write_map
 from fgloc.types import Setting
 from fgloc_datasets.bag import BagWriter
 
@@ -52,9 +54,7 @@ def drive(folder: Path, seed: int, told_by: str) -> Path:
                     bag.odometry("/odom", stamp, (0.0, 0.0, 0.0), (v, omega))
                 told.append((v, omega))
             if k % 20 == 0:
-                bag.truth(
-                    "/truth", stamp, (pose[0], pose[1], 0.0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2))
-                )
+                bag.planar_truth("/truth", stamp, pose)
             if k % 200 == 0 or k == 20:
                 bag.range_bearing("/landmarks", stamp, [sight(rng, pose, int(i)) for i in rng.choice(4, 2, False)])
             v, omega = told[-1 - late // 5]
@@ -62,8 +62,7 @@ def drive(folder: Path, seed: int, told_by: str) -> Path:
             turn = TRUE["scale_omega"] * omega + TRUE["yaw_per_m"] * v
             way = 0.01 * v + NOISE["x_per_sqrt_m"] * math.sqrt(0.01 * abs(v)) * rng.normal()
             pose = se2.compose(pose, se2.exp((way, 0.0, 0.01 * turn)))
-    rows = "".join(f"  - {{id: {i}, position: [{x}, {y}]}}\n" for i, (x, y) in BEACONS.items())
-    (folder / "map.yaml").write_text(f"landmarks:\n{rows}")
+    write_map(points(BEACONS), folder / "map.yaml")
     (folder / "robot.yaml").write_text(yaml_of(settings("twist" if told_by == "wheels" else told_by), folder))
     return folder / "bag"
 

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 import yaml
+from robot_world import points
 
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file
 from fgloc.recording.info import inspect
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
 
 PLACES = {1: (-40.0, -30.0, 0.0), 2: (45.0, -35.0, 0.0), 3: (40.0, 50.0, 0.0), 4: (-35.0, 40.0, 0.0)}
@@ -40,8 +40,7 @@ def write(folder, places=PLACES, sightings=False):
                 bag.range_reading("/ranges", stamp, length, f"anchor_{number}")
             if sightings and k % 10 == 0:
                 bag.range_bearing("/seen", stamp, [(1, 5.0, 0.1)])
-    plain = {i: Landmark(i, np.array(p), np.eye(3), 0.0) for i, p in places.items()}
-    write_map(LandmarkMap(plain, None), folder / "map.yaml")
+    write_map(points(places), folder / "map.yaml")
     return folder / "bag"
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import yaml
+from robot_world import points
 
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import Config, config_of_file
@@ -33,8 +34,7 @@ def settings(folder, has_map=True, sign=1.0, dark_scans=0, sees=False):
                 bag.laser_scan("/scan", stamp + scans, np.full(BEAMS, 4.0), intensities, (-math.pi, math.pi))
                 scans += 1
     if has_map:
-        places = {i: Landmark(i, np.array([i, 3.0, 0.0]), np.eye(3), 0.0) for i in range(4)}
-        write_map(LandmarkMap(places), folder / "map.yaml")
+        write_map(points([(i, 3.0) for i in range(4)]), folder / "map.yaml")
     return config_of_file(yaml.safe_load(first_settings(folder / "bag").text) or {})
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import yaml
+from robot_world import points
 
 from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
@@ -13,7 +14,6 @@ from fgloc.evaluation.metrics import compute_metrics
 from fgloc.motion_noise import identify_motion_noise, with_motion_noise
 from fgloc.runner import run
 from fgloc.sensors.maps import write_map
-from fgloc.types import Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
 
 START_NS, STEPS, STEP_S = 1_700_000_000 * 10**9, 900, 0.1
@@ -39,8 +39,7 @@ def record(folder, of_way: float, of_yaw: float, seed: int = 3, long: float = 1.
             near = [(i, r, b) for i, (r, b) in seen if abs(b) < 1.0]
             if k % 5 == 0:
                 bag.range_bearing("/landmarks", stamp, near, stamp)
-            half = 0.5 * true[2]
-            bag.truth("/truth", stamp, (*true[:2].tolist(), 0.0), (0.0, 0.0, math.sin(half), math.cos(half)), stamp)
+            bag.planar_truth("/truth", stamp, true)
             step = (
                 np.array([0.3 + 0.1 * math.sin(0.5 * STEP_S * k), 0.0, 0.2 + 0.2 * math.sin(0.3 * STEP_S * k)]) * STEP_S
             )
@@ -50,8 +49,7 @@ def record(folder, of_way: float, of_yaw: float, seed: int = 3, long: float = 1.
             sigma_yaw = of_yaw * math.sqrt(noise.yaw_per_sqrt_m**2 * way + noise.yaw_per_sqrt_rad**2 * turn)
             true = se2.compose(true, se2.exp(step))
             said = se2.compose(said, se2.exp(step + rng.normal(0.0, [sigma_x, sigma_y, sigma_yaw])))
-    landmarks = {i: Landmark(i, np.array([x, y, 0.0]), np.eye(3), 0.0) for i, (x, y) in enumerate(BEACONS.tolist())}
-    write_map(LandmarkMap(landmarks), folder / "map.yaml")
+    write_map(points(BEACONS), folder / "map.yaml")
     return folder / "bag"
 
 
@@ -113,6 +111,5 @@ def test_wheels_whose_geometry_is_unknown_have_no_noise(tmp_path):
             bag.joints("/joint_states", stamp, ["left_wheel", "right_wheel"], [0.3 * k, 0.5 * k])
             seen = [(i, math.hypot(a - x, b - y), math.atan2(b - y, a - x) - yaw) for i, (a, b) in enumerate(places)]
             bag.range_bearing("/landmarks", stamp, [(i, d, math.remainder(b, math.tau)) for i, d, b in seen])
-    landmarks = {i: Landmark(i, np.array([*place, 0.0]), np.eye(3), 0.0) for i, place in enumerate(places)}
-    write_map(LandmarkMap(landmarks), tmp_path / "map.yaml")
+    write_map(points(places), tmp_path / "map.yaml")
     assert identify_motion_noise(tmp_path / "bag", tmp_path / "map.yaml", Config()) is None

@@ -49,9 +49,7 @@ def write_tricycle(folder, seconds=80.0, truth=True):
             if k % 5 == 0 and truth:
                 if told is None or t % 10.0 > 1.0:
                     told = se2.compose(pose, BODY) + rng.normal(0.0, 0.002, 3)
-                half = 0.5 * told[2]
-                later = stamp + round(LATE_S * 1e9)
-                bag.truth("/truth", later, (*told[:2], 0.0), (0.0, 0.0, math.sin(half), math.cos(half)))
+                bag.planar_truth("/truth", stamp + round(LATE_S * 1e9), told)
             twist, _, _ = true.moves([rate], [steering])
             noise = rng.normal(0.0, 1.0, 3) * (0.003, 0.003, 0.003) * math.sqrt(0.005)
             pose = se2.compose(pose, se2.exp(twist * 0.01 + noise))
@@ -73,10 +71,9 @@ def write_odometry(folder, told=lambda k: True, n=409, commands=False):
             bag.odometry("/odom", stamp, reported.tolist(), (v / 1.05, omega))
             if commands:
                 bag.command("/cmd_vel", stamp, v, omega)
-            x, y, yaw = se2.compose(pose, BODY) + rng.normal(0.0, 0.002, 3)
+            body = se2.compose(pose, BODY) + rng.normal(0.0, 0.002, 3)
             if told(k):
-                turned = (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
-                bag.truth("/truth", stamp + round(LATE_S * 1e9), (x, y, 0.0), turned)
+                bag.planar_truth("/truth", stamp + round(LATE_S * 1e9), body)
             step = np.array([0.1 * v, 0.0, 0.1 * omega])
             pose = se2.compose(pose, se2.exp(step + rng.normal(0.0, 0.001, 3)))
             reported = se2.compose(reported, se2.exp(step / [1.05, 1.0, 1.0]))
@@ -104,8 +101,7 @@ def write_bare(folder, truth_m, truth_rad=0.002, seconds=46.0, rate_hz=20, turn=
             t, stamp = dt * k, START_NS + round(k * dt * 1e9)
             v, omega = 0.5 + 0.2 * math.sin(0.2 * t), turn * math.sin(0.4 * t)
             bag.odometry("/odom", stamp, reported.tolist(), (v / 1.05, omega))
-            x, y, yaw = pose + rng.normal(0.0, [truth_m, truth_m, truth_rad])
-            bag.truth("/truth", stamp + 20_000_000, (x, y, 0.0), (0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)))
+            bag.planar_truth("/truth", stamp + 20_000_000, pose + rng.normal(0.0, [truth_m, truth_m, truth_rad]))
             step = dt * np.array([v, 0.0, omega])
             pose, reported = se2.compose(pose, se2.exp(step)), se2.compose(reported, se2.exp(step / [1.05, 1.0, 1.0]))
     return folder / "bag"

@@ -10,17 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from circle_bag import BEACONS, write_circle
 from command_line import fgloc
+from robot_world import START_NS
 
 import fgloc_datasets
-from fgloc import se2
 from fgloc.files.outputs import write_tum
 from fgloc.sensors.maps import load_map
 from fgloc.types import Trajectory
-from fgloc_datasets.bag import BagWriter
 
-START_NS = 1_700_000_000_000_000_000
-BEACONS = {0: (3.0, 0.0), 1: (0.0, 3.0), 2: (-3.0, 0.0), 4: (0.0, -3.0)}
 FILES = {
     "trajectory.tum",
     "truth.tum",
@@ -35,32 +33,6 @@ FILES = {
     "map.yaml",
 }
 FILES_OF = {"batch": FILES, "smooth": FILES, "online": FILES | {"protection.csv"}}
-
-
-def write_circle(folder, seconds=10.0, sees=True, truth=True, start_ns=START_NS):
-    """A robot on a circle that sees four beacons, or none; ``bag`` with ``map.yaml`` beside it."""
-    rng = np.random.default_rng(3)
-    pose, odometry = np.array([1.0, 0.0, math.pi / 2]), np.zeros(3)
-    with BagWriter(folder / "bag") as bag:
-        for k in range(round(seconds * 20)):
-            stamp = start_ns + k * 50_000_000
-            bag.odometry("/odom", stamp, odometry, (0.4, 0.4))
-            if truth:
-                bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
-            if sees and k % 5 == 0:
-                bag.range_bearing("/landmarks", stamp, [sight(rng, pose, i) for i in BEACONS])
-            pose = se2.compose(pose, se2.exp((0.02, 0.0, 0.02)))
-            wobble = rng.normal(0.0, 0.001, 2)
-            odometry = se2.compose(odometry, se2.exp((0.02 + wobble[0], 0.0, 0.02 + wobble[1])))
-    rows = "".join(f"  - {{id: {i}, position: [{x}, {y}]}}\n" for i, (x, y) in BEACONS.items())
-    (folder / "map.yaml").write_text(f"landmarks:\n{rows}")
-    return folder / "bag"
-
-
-def sight(rng, pose, i):
-    dx, dy = BEACONS[i][0] - pose[0], BEACONS[i][1] - pose[1]
-    distance = math.hypot(dx, dy) + rng.normal(0.0, 0.05)
-    return i, distance, se2.wrap(math.atan2(dy, dx) - pose[2] + rng.normal(0.0, 0.02))
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from circle_bag import write_circle
 from command_line import fgloc
-from test_cli import write_circle
 from typer.main import get_command
 
 from fgloc import instrumentation as progress
@@ -298,8 +298,7 @@ def write_robot(path, seconds=8.0, truth=False):
             bag.joints("/joint_states", stamp, ("arm", "wheel_left", "wheel_right"), [0.0, *angles])
             bag.command("/cmd_vel", stamp, v, omega)
             if truth:
-                half = pose[2] / 2
-                bag.truth("/truth", stamp, (pose[0], pose[1], 0), (0, 0, np.sin(half), np.cos(half)))
+                bag.planar_truth("/truth", stamp, pose)
     return path
 
 

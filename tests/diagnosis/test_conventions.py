@@ -11,6 +11,7 @@ import pytest
 import yaml
 from command_line import fgloc
 from event_makers import odometry
+from robot_world import points
 
 from fgloc.calibration.first_settings import first_settings, with_findings
 from fgloc.config import Config, config_of, config_of_file, load_config
@@ -142,11 +143,8 @@ def record(folder: Path, wrong: Broken) -> Path:
         for _, write in sorted(messages, key=lambda m: m[0]):
             write()
     side = -1.0 if wrong.map_mirrored else 1.0
-    landmarks = {
-        i + wrong.shift: Landmark(i + wrong.shift, wrong.map * np.array([x, side * y, 0.0]), np.eye(3), 0.0)
-        for i, (x, y) in enumerate(BEACONS.tolist())
-    }
-    write_map(LandmarkMap(landmarks), folder / "map.yaml")
+    places = dict(enumerate((wrong.map * BEACONS * (1.0, side)).tolist(), wrong.shift))
+    write_map(points(places), folder / "map.yaml")
     return folder / "bag"
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robot_world import points
 
 from fgloc.config import config_of
 from fgloc.diagnosis.comparison import Conventions
@@ -73,7 +74,7 @@ def test_heights_that_wander_on_a_flat_floor_are_misfit_of_the_axes():
 
 @pytest.mark.parametrize(("given", "is_named"), [((0.0, 0.0, 0.0), False), ((0.8, -0.3, 0.0), True), (None, False)])
 def test_a_first_pose_that_the_first_sightings_contradict_is_named_and_not_used(given, is_named):
-    known = LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in places().items()})
+    known = points(places())
     found = Conventions(config_of({"estimator": {"initial_pose": given}}), Signals(), landmark_map=known)
     check_first_pose(found, path_of(), seen_from())
     assert found.codes == ({"frame.first_pose"} if is_named else set())
@@ -81,7 +82,7 @@ def test_a_first_pose_that_the_first_sightings_contradict_is_named_and_not_used(
 
 
 def test_sightings_before_the_first_message_of_the_wheels_do_not_contradict_a_first_pose():
-    known = LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in places().items()})
+    known = points(places())
     found = Conventions(config_of({"estimator": {"initial_pose": (0.0, 0.0, 0.0)}}), Signals(), landmark_map=known)
     seen = seen_from()
     check_first_pose(found, path_of(), replace(seen, times=seen.times - 0.2))

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import yaml
+from robot_world import points
 
 from fgloc import se2
 from fgloc.calibration.first_settings import first_settings
@@ -14,7 +15,6 @@ from fgloc.diagnosis.mistakes import find_mistakes
 from fgloc.diagnosis.ranges import check_ranges, fit_ranges
 from fgloc.diagnosis.signals import Path, Signals
 from fgloc.sensors.maps import write_map
-from fgloc.types import Landmark, LandmarkMap
 from fgloc_datasets.bag import BagWriter
 
 PLACES = {1: (-1.0, -1.0, 0.0), 2: (5.0, -1.2, 0.0), 3: (5.2, 4.0, 0.0), 4: (-1.1, 4.2, 0.0)}
@@ -44,8 +44,7 @@ def write(folder, turn=1.0, way=1.0, scale=1.0, bias_m=0.0, straight=False, mirr
             pose = se2.compose(pose, se2.exp((v * dt, 0.0, omega * dt)))
             reported = se2.compose(reported, se2.exp((way * v * dt, 0.0, turn * omega * dt)))
     side = -1.0 if mirrored else 1.0
-    plain = {i: Landmark(i, np.array([x, side * y, z]), np.eye(3), 0.0) for i, (x, y, z) in PLACES.items()}
-    write_map(LandmarkMap(plain, None), folder / "map.yaml")
+    write_map(points({i: (x, side * y, z) for i, (x, y, z) in PLACES.items()}), folder / "map.yaml")
     return folder / "bag"
 
 

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from robot_world import points, polar
 
 from fgloc import se2
 from fgloc.cli.terminal import EXIT_LOST, exit_code
@@ -312,13 +313,11 @@ def bag(folder, n=300, topics=("odometry", "sightings", "truth"), moving=True, h
             if "imu" in topics:
                 out.imu("/imu", stamp, (0.0, 0.0, turn), (0.0, 0.0, 9.81), stamp)
             if "truth" in topics:
-                quaternion = (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
-                out.truth("/truth", stamp, (x, y, 0.0), quaternion, received_ns=stamp)
+                out.planar_truth("/truth", stamp, pose)
             if "sightings" in topics:
                 seen = []
-                for i, place in BEACONS.items():
-                    at = se2.compose(se2.inverse(np.array(pose)), (*place, 0.0))
-                    seen.append((i, math.hypot(at[0], at[1]), math.atan2(at[1], at[0])))
+                for i, m in points(BEACONS).landmarks.items():
+                    seen.append((i, *polar(pose, m)))
                 out.range_bearing("/landmarks", stamp, seen, stamp)
     return folder / "bag"
 

@@ -32,8 +32,7 @@ def drive(folder, *, speed=1.0, steering=1.0, truth=True, gyro=True):
             if gyro:
                 bag.imu("/imu", stamp, (0.0, 0.0, omega[k] + rng.normal(0.0, 0.003)), (0.0, 0.0, 9.81))
             if truth:
-                turned = 0.0, 0.0, math.sin(0.5 * yaw[k]), math.cos(0.5 * yaw[k])
-                bag.truth("/ground_truth", stamp, (x[k], y[k], 0.0), turned)
+                bag.planar_truth("/ground_truth", stamp, (x[k], y[k], yaw[k]))
     return folder
 
 

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from robot_world import points
 
 import fgloc.estimation.place
 from fgloc import se2
@@ -20,7 +21,7 @@ from fgloc.types import Estimate, Landmark, LandmarkMap, Mode, MotionMeasurement
 
 STEP_NS = 100_000_000
 PLACES = ((4.0, 3.0), (-3.0, 4.0), (-4.0, -2.0), (3.0, -4.0), (9.0, 2.0))
-MAP = LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in enumerate(PLACES)})
+MAP = points(PLACES)
 _WALL = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a marker that faces -x
 MOTION = np.array([0.02, 0.0, 0.0])
 

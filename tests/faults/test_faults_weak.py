@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from test_ablation_sweep import SUITE, write_circle
+from circle_bag import write_circle
+from test_ablation_sweep import SUITE
 from test_graph import corner_sighting, wall_map
 
 from fgloc.ablation.jobs import log_attempt, only_sweep, read_record, record_path
@@ -82,7 +83,7 @@ def test_fault_38_a_run_says_that_the_distortion_is_taken_as_zero(tmp_path):
 @pytest.mark.slow
 def test_fault_71_disk_full_in_a_sweep_is_an_error_and_it_goes_on_later(tmp_path):
     """The kernel refuses what is written beyond 3 kB a file, for the workers too."""
-    write_circle(tmp_path)
+    write_circle(tmp_path, seconds=6.0)
     (tmp_path / "suite.yaml").write_text(yaml.safe_dump(SUITE | {"failures": []}))
     suite, out = str(tmp_path / "suite.yaml"), str(tmp_path / "out")
     command = [sys.executable, "-m", "fgloc.cli", "ablate", suite, "--out", out]

@@ -5,11 +5,12 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from circle_bag import write_circle
+from command_line import fgloc
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from recording_bags import START_NS, storage_file, write_drive
 from refusal import refusal
-from test_cli import fgloc, write_circle
 
 from fgloc.cli.terminal import say
 from fgloc.config import Config, GateConfig, RecordingConfig

@@ -2,52 +2,43 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from robot_world import CAMERA, SIGMA_PX, START_NS, T_BASE_CAM, TURN, World, project, room
-from scipy.spatial.transform import Rotation
+from robot_world import SIGMA_PX, START_NS, World, room
+from world_bags import write_world
 
 from fgloc import se2
 from fgloc.config import config_of
 from fgloc.evaluation.judgements import judgements
 from fgloc.evaluation.metrics import match_result
 from fgloc.runner import RunResult, run
-from fgloc.sensors.maps import write_map
-from fgloc.sensors.markers.images import CornersEvent
-from fgloc.sensors.wheels.events import OdometryEvent
-from fgloc.types import Severity
-from fgloc_datasets.bag import BagWriter
+from fgloc.types import ControlEvent, Severity
 
 SETTINGS = {"wheels": {"source": "twist"}, "markers": {"sigma_px": SIGMA_PX}}
 KNOCK_S, SECONDS = 20.0, 60.0
 LEVEL, TILTED = (0.0, 0.0, 0.06), (0.03, -0.07, 0.01)  # rad: roll, pitch, yaw of the camera since then
 
 
+@dataclass
+class Knocked(World):
+    """From `KNOCK_S` on the camera looks elsewhere."""
+
+    turned: tuple[float, float, float] = LEVEL
+
+    def _view(self, stamp: int):
+        pose = self.truth(stamp)
+        if (stamp - START_NS) * 1e-9 < KNOCK_S:
+            return pose, (0.0, 0.0)
+        return se2.compose(pose, (0.0, 0.0, self.turned[2])), self.turned[:2]
+
+
 def recorded(folder: Path, turned: tuple[float, float, float]) -> Path:
-    """Bag of a circle with a gyro; from `KNOCK_S` on the camera looks elsewhere."""
-    rng, world = np.random.default_rng(8), World(room(), seconds=SECONDS, rate=5)
-    yaw = turned[2]
-    with BagWriter(folder / "bag") as bag:
-        bag.camera_info("/camera_info", START_NS, (640, 480), CAMERA.K, [0.0] * 4, frame_id="cam")
-        quaternion = tuple(Rotation.from_matrix(T_BASE_CAM[:3, :3]).as_quat())
-        bag.static_transform(START_NS, "base_link", "cam", T_BASE_CAM[:3, 3], quaternion)
-        for event in world.events():
-            stamp, pose = event.stamp_ns, world.truth(event.stamp_ns)
-            if isinstance(event, OdometryEvent):
-                bag.odometry("/odom", stamp, pose, (event.linear[0], event.angular[2]))
-                bag.imu("/imu", stamp, (0.0, 0.0, TURN + 0.004 * rng.normal()), (0.0, 0.0, 9.81), frame_id="base_link")
-                bag.truth("/truth", stamp, (*pose[:2], 0.0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
-            if isinstance(event, CornersEvent):
-                after = (stamp - START_NS) * 1e-9 >= KNOCK_S
-                at, tilt = (se2.compose(pose, (0.0, 0.0, yaw)), turned[:2]) if after else (pose, (0.0, 0.0))
-                views = {i: project(at, m, tilt) for i, m in room().landmarks.items()}
-                seen = {i: c + rng.normal(0.0, SIGMA_PX, (4, 2)) for i, c in views.items() if c is not None}
-                bag.corners("/tags", stamp, seen, frame_id="cam", received_ns=stamp + 40_000_000)
-    write_map(room(), folder / "map.yaml")
-    return folder / "bag"
+    """Bag of a circle with a gyro."""
+    world = Knocked(room(), seed=8, seconds=SECONDS, rate=5, late_s=0.04, turned=turned)
+    return write_world(folder, world, leave_out=(ControlEvent,), gyro_sigma=0.004)
 
 
 @pytest.fixture(scope="module", params=[LEVEL, TILTED], ids=["level", "tilted"])

@@ -8,36 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import BEACONS, START_NS, fgloc, sight, write_circle
+from circle_bag import write_circle
+from command_line import fgloc
 
 import fgloc as fgloc_package
-from fgloc import se2
 from fgloc.config import Config, load_config
 from fgloc.recording.reader import open_recording
 from fgloc.runner import Outcome, run
 from fgloc.sensors.markers.images import CornersEvent, ImageEvent, MarkerCorners
 from fgloc.types import Finding, Mode, Severity
-from fgloc_datasets.bag import BagWriter
-
-
-def write_late_circle(folder, late_s, seconds=6.0):
-    """The circle of the command line's tests, its sightings stamped by a clock that is wrong."""
-    rng = np.random.default_rng(3)
-    pose = np.array([1.0, 0.0, np.pi / 2])
-    with BagWriter(folder / "bag") as bag:
-        for k in range(round(seconds * 20)):
-            stamp = START_NS + k * 50_000_000
-            bag.odometry("/odom", stamp, pose, (0.4, 0.4))
-            if k % 5 == 0:
-                sightings = [sight(rng, pose, i) for i in BEACONS]
-                bag.range_bearing("/landmarks", stamp - round(late_s * 1e9), sightings, received_ns=stamp)
-            pose = se2.compose(pose, se2.exp((0.02, 0.0, 0.02)))
-    return folder / "bag"
 
 
 @pytest.mark.parametrize("command", ["smooth", "online"])
 def test_sightings_dropped_for_their_stamps_are_said_first_and_exit_with_3(tmp_path, command):
-    bag = write_late_circle(tmp_path, 20.0)
+    bag = write_circle(tmp_path, seconds=6.0, truth=False, late_s=20.0)
+    (tmp_path / "map.yaml").unlink()
     code, stdout, stderr = fgloc(command, bag, "--out", tmp_path / "out")
     assert code == 3, stderr
     first = stdout.splitlines()[2]  # after the map and the configuration that are read

@@ -58,7 +58,7 @@ def recorded(folder: Path, late_s: float = 0.0, front_until_s: float = math.inf)
             stamp, pose = event.stamp_ns, world.truth(event.stamp_ns)
             if isinstance(event, OdometryEvent):
                 bag.odometry("/odom", stamp, pose, (event.linear[0], event.angular[2]))
-                bag.truth("/truth", stamp, (*pose[:2], 0.0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
+                bag.planar_truth("/truth", stamp, pose)
             if not isinstance(event, CornersEvent):
                 continue
             for name, turn in SIDES.items():

@@ -5,12 +5,14 @@ import math
 import numpy as np
 import pytest
 from event_makers import in_order_of_receipt, ns, run, stepper
+from robot_world import points, polar
 
 from fgloc import se2
 from fgloc.config import Config, WheelsConfig, yaml_of
 from fgloc.errors import ConfigError
 from fgloc.intake.validation import EventValidator
 from fgloc.runner import run as run_recording
+from fgloc.sensors.maps import write_map
 from fgloc.sensors.wheels.events import JointsEvent
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.types import ControlEvent
@@ -156,27 +158,20 @@ def write_mecanum(folder, seconds=60.0, seed=1):
     rng = np.random.default_rng(seed)
     true = wheels({**MECANUM, **TRUE}).drive
     inverse = true.equations(np.zeros(4), np.zeros(0)).A
-    pose, angles = np.zeros(3), np.zeros(4)
+    pose, angles, beacons = np.zeros(3), np.zeros(4), points(BEACONS).landmarks
     with BagWriter(folder / "bag") as bag:
         for k in range(round(100 * seconds)):
             t, stamp = 0.01 * k, START_NS + k * 10_000_000
             if k % 2 == 0:
                 bag.joints("/joint_states", stamp, WHEELS, angles.tolist())
             if k % 10 == 0:
-                half = 0.5 * pose[2]
-                bag.truth("/truth", stamp, (*pose[:2], 0.0), (0.0, 0.0, math.sin(half), math.cos(half)))
-                seen = []
-                for i, place in BEACONS.items():
-                    x, y, _ = se2.between(pose, (*place, 0.0))
-                    seen.append(
-                        (i, math.hypot(x, y) + rng.normal(0.0, 0.02), math.atan2(y, x) + rng.normal(0.0, 0.005))
-                    )
+                bag.planar_truth("/truth", stamp, pose)
+                seen = [(i, *(polar(pose, m) + rng.normal(0.0, (0.02, 0.005)))) for i, m in beacons.items()]
                 bag.range_bearing("/landmarks", stamp, seen[(k // 10) % 2 :: 2])
             way = np.array([0.4 * math.cos(0.5 * t), 0.4 * math.sin(0.7 * t), 0.4 * math.sin(0.3 * t)]) * 0.01
             angles = angles + inverse @ way / TRUE["radius"]
             pose = se2.compose(pose, se2.exp(way + rng.normal(0.0, 2e-4, 3)))
-    rows = "".join(f"  - {{id: {i}, position: [{x}, {y}]}}\n" for i, (x, y) in BEACONS.items())
-    (folder / "map.yaml").write_text(f"landmarks:\n{rows}")
+    write_map(points(BEACONS), folder / "map.yaml")
     config = Config.model_validate(
         {
             "wheels": {

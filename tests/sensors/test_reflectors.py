@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import yaml
+from robot_world import points
 from typer.testing import CliRunner
 
 from fgloc import Live, se2
@@ -72,7 +73,7 @@ class Drive:
             for k in range(round(self.seconds * 1e9 / TICK_NS)):
                 stamp, at_s = START_NS + k * TICK_NS, k * TICK_NS * 1e-9
                 v, omega = 0.6, 0.45 * math.copysign(1.0, math.sin(math.tau * at_s / 28.0))
-                bag.truth("/truth", stamp, (*pose[:2], 0.0), yaw_quaternion(pose[2]).tolist())
+                bag.planar_truth("/truth", stamp, pose)
                 bag.odometry("/odom", stamp, odometry.tolist(), (v, omega))
                 if k % 4 == 1:
                     self._scan(bag, stamp, pose, (v, 0.0, omega), rng)
@@ -80,8 +81,7 @@ class Drive:
                 pose = se2.compose(pose, se2.exp(np.array([0.05 * v, 0.0, 0.05 * omega])))
                 if at_s <= self.carried_s < at_s + 1e-9 * TICK_NS:
                     pose = np.array([-3.0, 2.5, -1.0])
-        landmarks = {i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in enumerate(self.places)}
-        write_map(LandmarkMap(landmarks), folder / "map.yaml")
+        write_map(points(self.places), folder / "map.yaml")
         return folder / "bag"
 
     def _scan(self, bag, stamp, pose, twist, rng):
@@ -115,10 +115,6 @@ def built(landmark_map, frame=lambda name: None, **settings):
     return Reflectors.build(Context(config_of({}), section, {}, landmark_map, frame))
 
 
-def points(*places):
-    return LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in enumerate(places)})
-
-
 def scan(ranges, bright, step_s=0.0):
     """A turn of a scanner of 360 beams from -pi on."""
     measured, intensities = np.full(360, np.nan), np.zeros(360)
@@ -133,14 +129,14 @@ def scan(ranges, bright, step_s=0.0):
 
 def test_bright_beams_next_to_each_other_are_one_hit():
     hits = list(
-        built(points((1, 1))).measure(scan({268: 3.0, 270: 3.02, 272: 3.04, 90: 5.0, 91: 4.0}, (268, 270, 272, 90)))
+        built(points([(1, 1)])).measure(scan({268: 3.0, 270: 3.02, 272: 3.04, 90: 5.0, 91: 4.0}, (268, 270, 272, 90)))
     )
     assert [(round(m.range_m, 3), round(m.bearing_rad, 3)) for m in hits] == [(5.0, -1.571), (3.02, 1.571)]
     assert all(m.unnamed and m.row_id == -1 for m in hits)
 
 
 def test_a_spot_across_the_first_beam_is_one_hit_and_a_wide_one_is_none():
-    sensor = built(points((1, 1)))
+    sensor = built(points([(1, 1)]))
     (m,) = sensor.measure(scan({0: 2.0, 359: 2.0}, (0, 359)))
     assert abs(m.bearing_rad) == pytest.approx(math.pi, abs=0.02)
     wall = dict.fromkeys(range(100, 120), 2.0)
@@ -151,20 +147,23 @@ def test_a_spot_across_the_first_beam_is_one_hit_and_a_wide_one_is_none():
 
 def test_hits_are_moved_to_the_base_and_have_the_time_of_their_beam():
     event = scan({180: 2.0, 270: 2.0}, (180, 270), step_s=1e-4)
-    at_pose = list(built(points((1, 1)), pose=(1.0, 0.5, math.pi / 2), radius_m=0.1).measure(event))
+    at_pose = list(built(points([(1, 1)]), pose=(1.0, 0.5, math.pi / 2), radius_m=0.1).measure(event))
     np.testing.assert_allclose([m.point for m in at_pose], [[1.0, 2.6], [-1.1, 0.5]], atol=1e-9)
     assert [m.stamp_ns for m in at_pose] == [1_000 + 18_000_000, 1_000 + 27_000_000]
     assert {m.scan_ns for m in at_pose} == {1_000}
     upside_down = np.diag([1.0, -1.0, -1.0, 1.0])
-    assert [round(m.point[1], 6) for m in built(points((1, 1)), lambda name: upside_down).measure(event)] == [0.0, -2.0]
-    unplaced = built(points((1, 1)))
+    assert [round(m.point[1], 6) for m in built(points([(1, 1)]), lambda name: upside_down).measure(event)] == [
+        0.0,
+        -2.0,
+    ]
+    unplaced = built(points([(1, 1)]))
     assert len(list(unplaced.measure(event))) == 2
     assert "'laser'" in unplaced.notes[0]
     assert "reflectors.pose" in unplaced.notes[0]
 
 
 def test_a_scan_that_is_bright_all_over_is_not_used():
-    sensor = built(points((1, 1)))
+    sensor = built(points([(1, 1)]))
     every = dict.fromkeys(range(0, 360, 4), 20.0)
     assert not list(sensor.measure(scan(every, every)))
     assert "raise reflectors.min_intensity" in sensor.notes[-1]
@@ -182,7 +181,7 @@ def test_checks_say_what_is_wrong_with_a_scan():
 
 def test_without_a_map_nothing_can_name_a_hit():
     sensor = LandmarkSensor(config_of({}), None, None, None)
-    assert not sensor.known(built(points((1, 1))).measure(scan({180: 2.0}, (180,))))
+    assert not sensor.known(built(points([(1, 1)])).measure(scan({180: 2.0}, (180,))))
     assert sensor.rejections == {"reflectors.unknown_id": 1}
 
 
@@ -191,7 +190,7 @@ def test_a_map_without_points_is_refused():
     with pytest.raises(ConfigError, match="no points"):
         built(LandmarkMap({1: marker}))
     assert built(None) is None
-    assert built(points((1, 1)), min_intensity=None) is None
+    assert built(points([(1, 1)]), min_intensity=None) is None
 
 
 # --- Whole runs -------------------------------------------------------------------------------------------------------
@@ -241,7 +240,7 @@ def test_in_a_dense_map_no_hit_gets_a_wrong_name(tmp_path):
     places = rng.uniform(-8.0, 8.0, (80, 2))
     seen, strange = tuple(map(tuple, places[:12])), tuple(map(tuple, rng.uniform(-6.0, 6.0, (5, 2))))
     bag = Drive(seen, strange, seconds=16.0).write(tmp_path)
-    write_map(points(*places), tmp_path / "dense.yaml")
+    write_map(points(places), tmp_path / "dense.yaml")
     result = run(bag, tmp_path / "dense.yaml", config_of(SETTINGS), "batch")
     assert compute_metrics(result, config_of(SETTINGS)).ate_rmse_m < 0.03
     used = [d.landmark_id for d in result.decisions if d.kind == "reflectors" and not d.reason]
@@ -254,7 +253,7 @@ def test_a_hit_that_two_beacons_explain_is_rejected(tmp_path):
     drive = Drive()
     bag = drive.write(tmp_path)
     x, y = ROOM[0]
-    twins = points(*ROOM, (x + 0.05, y - 0.05))
+    twins = points([*ROOM, (x + 0.05, y - 0.05)])
     write_map(twins, tmp_path / "twins.yaml")
     result = run(bag, tmp_path / "twins.yaml", config_of(SETTINGS), "online")
     assert compute_metrics(result, config_of(SETTINGS)).ate_rmse_m < 0.03
@@ -279,7 +278,7 @@ def test_another_place_of_the_same_kind_starts_nowhere(tmp_path):
     """None of the reflectors is in the map."""
     elsewhere = tuple((0.8 * y + 1.0, x - 2.0) for x, y in ROOM)
     bag = Drive(seconds=8.0).write(tmp_path)
-    write_map(points(*elsewhere), tmp_path / "other.yaml")
+    write_map(points(elsewhere), tmp_path / "other.yaml")
     with pytest.raises(EstimatorError, match=r"estimator\.initial_pose"):
         run(bag, tmp_path / "other.yaml", config_of(SETTINGS), "online")
 

@@ -59,7 +59,7 @@ def write_mistaken(
             if gyro and tick % 2 == 0:
                 bag.imu("/imu", stamp, (0.0, 0.0, omega + 0.005 + rng.normal(0.0, 0.004)), (0.0, v * omega, 9.81))
             if tick % 10 == 0:
-                bag.truth("/truth", stamp, (*pose[:2], 0.0), (0, 0, math.sin(pose[2] / 2), math.cos(pose[2] / 2)))
+                bag.planar_truth("/truth", stamp, pose)
                 seen = []
                 for i in rng.choice(9, 3, replace=False):
                     r, bearing = polar(pose, places.landmarks[int(i)])

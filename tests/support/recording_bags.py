@@ -31,8 +31,7 @@ def write_drive(folder: Path, storage: str = "mcap", n: int = 200, start_ns: int
             bag.odometry("/odom", stamp, pose, (0.4, 0.4), received, (np.eye(6) * 1e-3, np.eye(6) * 1e-3))
             bag.command("/cmd_vel", stamp, 0.4, 0.4, received)
             bag.joints("/joint_states", stamp, ["left", "right"], [0.1 * k, 0.12 * k], received_ns=received)
-            truth = (pose[0], pose[1], 0.0), (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
-            bag.truth("/ground_truth/pose", stamp, *truth, received_ns=received)
+            bag.planar_truth("/ground_truth/pose", stamp, pose, received)
             if k % 5 == 0:
                 bag.range_bearing("/landmarks", stamp, [(1, 2.0, 0.1), (0, 3.0, -0.2)], received)
     return folder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,7 +63,13 @@ def beacons(n: int = 7, seed: int = 3) -> LandmarkMap:
     rng = np.random.default_rng(seed)
     angles = np.linspace(0.0, 2 * math.pi, n, endpoint=False) + rng.uniform(0.0, 0.5, n)
     places = rng.uniform(2.5, 4.5, n)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    return LandmarkMap({i: Landmark(i, np.array([*p, 0.0]), np.eye(3), 0.0) for i, p in enumerate(places)})
+    return points(places)
+
+
+def points(places) -> LandmarkMap:
+    """Points at ``(x, y)`` or ``(x, y, z)``, by id or in the order of their ids."""
+    named = places if isinstance(places, Mapping) else dict(enumerate(places))
+    return LandmarkMap({i: Landmark(i, np.array([*p, 0.0])[:3], np.eye(3), 0.0) for i, p in named.items()})
 
 
 def truth_at(t: float, turned: float = 0.0) -> np.ndarray:
@@ -157,10 +163,9 @@ class World:
         return OdometryEvent(stamp, stamp, "/odom", "odom", "base_link", *place, *twist, np.zeros((6, 6)))
 
     def _sightings(self, stamp: int) -> CornersEvent | RangeBearingEvent:
-        pose, received = self.truth(stamp), stamp + round(self.late_s * 1e9)
+        (pose, tilt), received = self._view(stamp), stamp + round(self.late_s * 1e9)
         landmarks = (self.shown or self.map).landmarks.values()
         if self.sees_corners:
-            tilt = self._rng.normal(0.0, self.sway_rad, 2) if self.sway_rad else (0.0, 0.0)
             seen = [(m.landmark_id, c) for m in landmarks if (c := project(pose, m, tilt)) is not None]
             noisy = [MarkerCorners(i, c + self._rng.normal(0.0, SIGMA_PX, (4, 2))) for i, c in seen]
             return CornersEvent(stamp, received, "/tags", "cam", tuple(noisy))
@@ -170,6 +175,10 @@ class World:
             r = self.range_scale * r + self._rng.normal(0.0, SIGMA_RANGE)
             made.append(RangeBearing(int(i), r, bearing + self.bearing_bias + self._rng.normal(0.0, SIGMA_BEARING)))
         return RangeBearingEvent(stamp, received, "/landmarks", "base_link", tuple(made))
+
+    def _view(self, stamp: int):
+        """Pose from which the sensor looks, and roll and pitch of its camera."""
+        return self.truth(stamp), self._rng.normal(0.0, self.sway_rad, 2) if self.sway_rad else (0.0, 0.0)
 
 
 def _within(t: float, spans: Iterable[tuple[float, float]]) -> bool:

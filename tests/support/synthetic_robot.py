@@ -78,5 +78,5 @@ def write_bag(path: Path, seed: int, seconds: float) -> None:
     with BagWriter(path) as bag:
         for c in commands:
             bag.command("/cmd_vel", c.stamp_ns, c.v, c.omega)
-        for stamp, (x, y, yaw) in zip(stamps[::2].tolist(), poses[::2], strict=True):
-            bag.truth("/truth", stamp, [x, y, 0.0], [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
+        for stamp, pose in zip(stamps[::2].tolist(), poses[::2], strict=True):
+            bag.planar_truth("/truth", stamp, pose)

@@ -39,13 +39,8 @@ def write_windows(
             commands, stamps, poses = drive(np.random.default_rng(seed), seconds)
             for c in commands:
                 bag.command("/cmd_vel", c.stamp_ns + later, c.v, c.omega)
-            for stamp, (x, y, yaw) in zip(stamps[::every].tolist(), poses[::every], strict=True):
-                bag.truth(
-                    "/truth",
-                    stamp + later + round(late_s * SECOND),
-                    [x, y, 0.0],
-                    [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)],
-                )
+            for stamp, pose in zip(stamps[::every].tolist(), poses[::every], strict=True):
+                bag.planar_truth("/truth", stamp + later + round(late_s * SECOND), pose)
 
 
 def test_a_recording_that_falls_silent_is_several_runs(tmp_path: Path) -> None:
