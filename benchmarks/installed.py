@@ -50,15 +50,18 @@ from benchmarks.recordings import (
 )
 from benchmarks.replays import Replayed, by_recording, failures, floor, kept, processor_times, replayed
 from benchmarks.scores import (
+    Figure,
     Scores,
-    errors,
+    figures,
     found_by,
     found_errors,
     inside,
-    lost_share,
+    kept_scores,
     map_over_survey,
+    mean_of,
+    of_errors,
     places_in,
-    refused_share,
+    trajectory_scores,
 )
 from benchmarks.textbook import PIPELINES, Textbook
 from fgloc.calibration.survey import survey
@@ -91,7 +94,7 @@ _MAPS = {
 }
 _MAPPED = 3  # seeds of the validation split that are mapped
 _LEFT_OUT = "left out of a quick run"
-_Figure = Callable[[Scores], float | None]
+_ONLINE_MM = of_errors("online", "ate_mm")
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -147,23 +150,23 @@ def measure(
 def wanted() -> Iterator[Wanted]:
     """All rows but those of maps."""
     for case in CASES:
-        yield Wanted(f"{case}.batch.nees_over_3", _mean(lambda s: s.batch and s.batch.nees_over_3), case)
-        yield Wanted(f"{case}.online.nees_over_3", _mean(lambda s: s.online and s.online.nees_over_3), case)
-        yield Wanted(f"{case}.batch.ate_mm", _mean(_batch_mm, "mm"), case)
-        yield Wanted(f"{case}.online.ate_mm", _mean(_online_mm, "mm"), case)
+        yield Wanted(f"{case}.batch.nees_over_3", _mean(of_errors("batch", "nees_over_3")), case)
+        yield Wanted(f"{case}.online.nees_over_3", _mean(of_errors("online", "nees_over_3")), case)
+        yield Wanted(f"{case}.batch.ate_mm", _mean(of_errors("batch", "ate_mm"), "mm"), case)
+        yield Wanted(f"{case}.online.ate_mm", _mean(_ONLINE_MM, "mm"), case)
         yield Wanted(f"{case}.online.lost_share", _mean(lambda s: s.lost_share), case)
         yield Wanted(f"{case}.update_p99_ms", _updates(99.0), case)
         yield Wanted(f"{case}.update_median_ms", _updates(50.0), case)
-    yield Wanted("none.batch.yaw_deg", _mean(lambda s: s.batch and s.batch.yaw_deg, "deg"))
+    yield Wanted("none.batch.yaw_deg", _mean(of_errors("batch", "yaw_deg"), "deg"))
     yield Wanted("none.refused_share", _mean(lambda s: s.refused_share))
-    yield Wanted("map5mm.batch.ate_mm", _mean(_batch_mm, "mm"), variant="map5mm")
-    yield Wanted("map5mm.online.ate_mm", _mean(_online_mm, "mm"), variant="map5mm")
-    nees = _mean(lambda s: s.online and s.online.nees_over_3)
+    yield Wanted("map5mm.batch.ate_mm", _mean(of_errors("batch", "ate_mm"), "mm"), variant="map5mm")
+    yield Wanted("map5mm.online.ate_mm", _mean(_ONLINE_MM, "mm"), variant="map5mm")
+    nees = _mean(of_errors("online", "nees_over_3"))
     yield Wanted("map5mm.online.nees_over_3", nees, variant="map5mm")
-    yield Wanted("perfect.none.online.ate_mm", _mean(_online_mm, "mm"), variant="perfect")
+    yield Wanted("perfect.none.online.ate_mm", _mean(_ONLINE_MM, "mm"), variant="perfect")
     for case in TEXTBOOK_CASES:
         yield Wanted(f"textbook.{case}.best_over_fgloc", best_over_fgloc, case, plain=True)
-        yield Wanted(f"textbook.{case}.fgloc.ate_mm", _mean(_online_mm, "mm"), case, plain=True)
+        yield Wanted(f"textbook.{case}.fgloc.ate_mm", _mean(_ONLINE_MM, "mm"), case, plain=True)
         for pipeline in PIPELINES:
             figure = _mean(lambda s, p=pipeline: s.textbook_mm.get(p), "mm")  # type: ignore[misc]
             yield Wanted(f"textbook.{case}.{pipeline}.ate_mm", figure, case, plain=True)
@@ -173,29 +176,15 @@ def wanted() -> Iterator[Wanted]:
     yield Wanted("found.coverage3", coverage3, variant="found")
 
 
-def _online_mm(scores: Scores) -> float | None:
-    return None if scores.online is None else scores.online.ate_mm
-
-
-def _batch_mm(scores: Scores) -> float | None:
-    return None if scores.batch is None else scores.batch.ate_mm
-
-
-def _mean(figure: _Figure, unit: str = "") -> Callable[[str, Sequence[Scores]], Row]:
-    """Mean and standard deviation over the seeds."""
-
-    def row(row_id: str, scores: Sequence[Scores]) -> Row:
-        values, missing = _values(row_id, scores, figure)
-        return missing or mean_row(row_id, values, unit)
-
-    return row
+def _mean(figure: Figure, unit: str = "") -> Callable[[str, Sequence[Scores]], Row]:
+    return lambda row_id, scores: mean_of(row_id, scores, figure, unit)
 
 
 def _rms(name: str, factor: float, unit: str) -> Callable[[str, Sequence[Scores]], Row]:
     """Root mean square of an error of the installation; the spread is that of its size."""
 
     def row(row_id: str, scores: Sequence[Scores]) -> Row:
-        values, missing = _values(row_id, scores, lambda s: s.found[name][0] if s.found and name in s.found else None)
+        values, missing = figures(row_id, scores, lambda s: s.found[name][0] if s.found and name in s.found else None)
         size = factor * np.abs(values)
         return missing or Row(row_id, float(np.sqrt(np.mean(size**2))), float(np.std(size)), len(values), unit)
 
@@ -204,7 +193,7 @@ def _rms(name: str, factor: float, unit: str) -> Callable[[str, Sequence[Scores]
 
 def coverage3(row_id: str, scores: Sequence[Scores]) -> Row:
     """Share of all values found that are within three of their sigmas of the truth; the spread is over the seeds."""
-    values, missing = _values(row_id, scores, lambda s: float(np.mean(inside(s.found))) if s.found else None)
+    values, missing = figures(row_id, scores, lambda s: float(np.mean(inside(s.found))) if s.found else None)
     every = [good for s in scores if s.found for good in inside(s.found)]
     return missing or Row(row_id, float(np.mean(every)), float(np.std(values)), len(values))
 
@@ -213,8 +202,8 @@ def _updates(percentile: float) -> Callable[[str, Sequence[Scores]], Row]:
     """Percentile over the updates of all seeds; the spread is that of the seeds' own."""
 
     def row(row_id: str, scores: Sequence[Scores]) -> Row:
-        figure: _Figure = lambda s: float(np.percentile(s.update_ms, percentile)) if s.update_ms else None  # noqa: E731
-        values, missing = _values(row_id, scores, figure)
+        figure: Figure = lambda s: float(np.percentile(s.update_ms, percentile)) if s.update_ms else None  # noqa: E731
+        values, missing = figures(row_id, scores, figure)
         every = [ms for s in scores for ms in s.update_ms]
         return missing or Row(row_id, float(np.percentile(every, percentile)), float(np.std(values)), len(values), "ms")
 
@@ -223,7 +212,7 @@ def _updates(percentile: float) -> Callable[[str, Sequence[Scores]], Row]:
 
 def best_over_fgloc(row_id: str, scores: Sequence[Scores]) -> Row:
     """Least mean error of the textbook's pipelines over fgloc's; the spread is that of the single ratios."""
-    ours, missing = _values(row_id, scores, _online_mm)
+    ours, missing = figures(row_id, scores, _ONLINE_MM)
     if missing:
         return missing
     theirs = {p: np.array([s.textbook_mm[p] for s in scores]) for p in PIPELINES}
@@ -233,23 +222,12 @@ def best_over_fgloc(row_id: str, scores: Sequence[Scores]) -> Row:
     return ratio_row(row_id, best, ours)
 
 
-def _values(row_id: str, scores: Sequence[Scores], figure: _Figure) -> tuple[list[float], Row | None]:
-    """The figure of each seed; and a row that says why there is none, if one is missing."""
-    values = [None if s.failed else figure(s) for s in scores]
-    known = [v for v in values if v is not None and math.isfinite(v)]
-    if len(known) == len(scores):
-        return known, None
-    missing = [s for s, v in zip(scores, values, strict=True) if v is None or not math.isfinite(v)]
-    why = next((said for s in missing if (said := s.failed or s.batch_failed)), "the run says nothing of it")
-    return known, Row(row_id, None, n=len(scores), reason=f"in {len(missing)} of {len(scores)} runs: {why}")
-
-
 # --- Many cells -------------------------------------------------------------------------------------------------------
 
 
 def scores_of(cell: Cell) -> Scores:
     """Scores of a cell, from the cache or run now."""
-    return Scores.from_json(kept(cell.name, lambda: run_cell(cell).as_json()))
+    return kept_scores(cell.name, lambda: run_cell(cell))
 
 
 # --- One cell ---------------------------------------------------------------------------------------------------------
@@ -280,19 +258,13 @@ def run_cell(cell: Cell) -> Scores:
 
 
 def _scores(recorded: Recorded, config: Config, made: Replayed, times: Sequence[float], plain: bool) -> Scores:
-    unknown = made.unknown_ns(recorded.start_ns)
-    online, batch = made.online, made.batch
-    found = None if batch is None or recorded.installed is None else found_by(batch)
-    return Scores(
-        online=errors(online, config, unknown),
-        batch=None if batch is None else errors(batch, config, unknown),
-        lost_share=lost_share(online.modes, online.trajectory.stamps_ns, unknown),
-        refused_share=refused_share(online.decisions),
+    installed = recorded.installed
+    found = None if made.batch is None or installed is None else found_by(made.batch)
+    return replace(
+        trajectory_scores(made, config, made.unknown_ns(recorded.start_ns)),
         update_ms=tuple(round(ms, 4) for ms in times),
-        found=None if found is None else found_errors(found, recorded.installed or {}),
-        map_over_survey=None
-        if found is None
-        else map_over_survey(places_in(found), made.landmarks, recorded.installed or {}),
+        found=None if found is None else found_errors(found, installed or {}),
+        map_over_survey=None if found is None else map_over_survey(places_in(found), made.landmarks, installed or {}),
         textbook_mm=textbook_mm(recorded, config, made) if plain else {},
     )
 

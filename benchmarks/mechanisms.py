@@ -36,9 +36,9 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -48,8 +48,20 @@ from benchmarks.installed import Cell as InstalledCell
 from benchmarks.installed import scores_of
 from benchmarks.mechanisms_off import BY_NAME, JOIN, MECHANISMS, Mechanism, together, watched
 from benchmarks.recordings import MRCLAM, SEEDS, Floor, Recorded, Split, Take, changed, folder, load, prepare, robot
-from benchmarks.replays import FAILURES, Replayed, by_recording, failure, floor, kept, parallel, replayed
-from benchmarks.scores import Errors, Scores, errors, lost_share, named, slips
+from benchmarks.replays import FAILURES, Replayed, by_recording, failure, floor, parallel, replayed
+from benchmarks.scores import (
+    Errors,
+    Figure,
+    Scores,
+    Slips,
+    kept_scores,
+    mean_of,
+    named,
+    of_errors,
+    ratio_of,
+    slips,
+    trajectory_scores,
+)
 from fgloc.ablation.failures import MovedMarker
 from fgloc.config import Config
 from fgloc.errors import FglocError
@@ -107,50 +119,7 @@ class Cell:
     off: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """Figures of one run, as they are kept.
-
-    Attributes:
-        online, batch: of the estimates as they were made and of the smoothed ones; None if there are none.
-        poses: estimates online.
-        lost_share: of the poses, those of mode LOST.
-        named, moved: landmarks that the notes of the run name as moved, and those that were moved.
-        wrong_names: landmarks and faults of wheels that are named although they are not there.
-        missed_names: those that are there and not named.
-        delays_s, found_m, missed_m, false_alarms, path_m: of slips, as in `benchmarks.scores`.
-        lifted_nees: NEES/3 while a robot was carried and until it saw a marker again; None without a kidnapping.
-        acted: how often each mechanism acted, by name; of the run with all of them on.
-        failed: why there are no figures.
-    """
-
-    online: Errors | None = None
-    batch: Errors | None = None
-    poses: int = 0
-    lost_share: float = 0.0
-    named: tuple[int, ...] = ()
-    moved: tuple[int, ...] = ()
-    wrong_names: int = 0
-    missed_names: int = 0
-    delays_s: tuple[float, ...] = ()
-    found_m: tuple[float, ...] = ()
-    missed_m: tuple[float, ...] = ()
-    false_alarms: int = 0
-    path_m: float = 0.0
-    lifted_nees: float | None = None
-    acted: dict[str, int] = field(default_factory=dict)
-    failed: str = ""
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Outcome from values of `asdict`, as JSON keeps them."""
-        told = {name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
-        for name in ("online", "batch"):
-            told[name] = None if told[name] is None else Errors(**told[name])
-        return cls(**told)
-
-
-def run(cell: Cell) -> Outcome:
+def run(cell: Cell) -> Scores:
     """Replay and score a case; a failed run has its reason, and the run with everything on is smoothed too."""
     mechanism = BY_NAME.get(cell.off)
     recorded = robot(cell.source) if isinstance(cell.source, int) else load(cell.source)
@@ -158,7 +127,7 @@ def run(cell: Cell) -> Outcome:
     try:
         failures = [failure(described) for described in chain(cell.case, recorded)]
     except ValueError as error:  # a drive too short for the failure
-        return Outcome(failed=str(error))
+        return Scores(failed=str(error))
     smooth = (
         not isinstance(cell.source, int)
         and (cell.case in OWN_CASES or cell.case in FAILURES)
@@ -170,9 +139,9 @@ def run(cell: Cell) -> Outcome:
             config = changed(recorded.config, settings(cell.case, recorded))
             made = replayed(recorded, config, failures, seed, smooth)
         except (FglocError, RuntimeError, ValueError, ArithmeticError) as error:
-            return Outcome(failed=f"{type(error).__name__}: {str(error).splitlines()[0][:200]}")
+            return Scores(failed=f"{type(error).__name__}: {str(error).splitlines()[0][:200]}")
     if made is None:
-        return Outcome(failed="no pose was ever found")
+        return Scores(failed="no pose was ever found")
     return _scored(cell, recorded, made, dict(acted))
 
 
@@ -210,27 +179,22 @@ def settings(case: str, recorded: Recorded) -> dict[str, Any]:
     return {FOREIGN: _FOREIGN_MODEL, WHEELS: _WHEELS_ALONE}.get(case, {})
 
 
-def _scored(cell: Cell, recorded: Recorded, made: Replayed, acted: dict[str, int]) -> Outcome:
-    config, online, batch = recorded.config, made.online, made.batch
-    unknown = None if cell.case == PUSHED else made.unknown_ns(recorded.start_ns)
+def _scored(cell: Cell, recorded: Recorded, made: Replayed, acted: dict[str, int]) -> Scores:
+    online, unknown = made.online, None if cell.case == PUSHED else made.unknown_ns(recorded.start_ns)
     told = named(online)
     moved = frozenset(i for f in made.chain if isinstance(f, MovedMarker) for i in f.ids)
     moved = frozenset() if cell.case == GIVEN else moved
     reasons = {d.reason for d in online.decisions if d.kind == "wheels"} & _NAMED_KINDS
     right = {_KINDS[cell.case]} if cell.case in _KINDS else set()
-    slipped = {} if isinstance(cell.source, int) else asdict(slips(recorded, online))
-    return Outcome(
-        online=errors(online, config, unknown),
-        batch=None if batch is None else errors(batch, config, unknown),
-        poses=len(online.trajectory),
-        lost_share=lost_share(online.modes, online.trajectory.stamps_ns, unknown),
+    return replace(
+        trajectory_scores(made, recorded.config, unknown),
         named=tuple(sorted(told)),
         moved=tuple(sorted(moved)),
         wrong_names=len(told - moved) + len(reasons - right),
         missed_names=len(moved - told) + len(right - reasons),
-        lifted_nees=None if unknown is None else nees_between(online, config, unknown),
+        slips=Slips() if isinstance(cell.source, int) else slips(recorded, online),
+        lifted_nees=None if unknown is None else nees_between(online, recorded.config, unknown),
         acted=acted,
-        **slipped,
     )
 
 
@@ -246,25 +210,25 @@ def nees_between(result: RunResult, config: Config, span_ns: tuple[int, int]) ->
 # --- Many cells -------------------------------------------------------------------------------------------------------
 
 
-def run_all(cells: Iterable[Cell], jobs: int) -> dict[Cell, Outcome]:
+def run_all(cells: Iterable[Cell], jobs: int) -> dict[Cell, Scores]:
     """Outcomes of all cells, from the cache or run now; a process keeps to one recording at a time."""
     ordered = sorted(set(cells), key=lambda cell: (str(cell.source), cell.case, cell.off))
     return by_recording(outcome, ordered, attrgetter("source"), jobs)
 
 
-def outcome(cell: Cell) -> Outcome:
+def outcome(cell: Cell) -> Scores:
     """Figures of one cell; of mechanisms that do not act, those of the run with all of them on."""
     if not cell.off:
-        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell)), *_SCORING))
+        return kept_scores(file_name(cell), lambda: run(cell), *_SCORING)
     alone = [BY_NAME[name] for name in cell.off.split(JOIN)]
     if all(m.probe for m in alone):
         on = outcome(Cell(cell.source, cell.case))
         if not any(on.acted.get(m.name) for m in alone):
             return on
     if len(alone) == 1:
-        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(cell)), *_SCORING))
+        return kept_scores(file_name(cell), lambda: run(cell), *_SCORING)
     with mechanism_of(cell.off).off():
-        return Outcome.from_json(kept(file_name(cell), lambda: asdict(run(Cell(cell.source, cell.case))), *_SCORING))
+        return kept_scores(file_name(cell), lambda: run(Cell(cell.source, cell.case)), *_SCORING)
 
 
 def mechanism_of(off: str) -> Mechanism:
@@ -282,7 +246,7 @@ def file_name(cell: Cell) -> str:
 # --- Effects ----------------------------------------------------------------------------------------------------------
 
 
-Pairs = Sequence[tuple[Outcome, Outcome]]
+Pairs = Sequence[tuple[Scores, Scores]]
 """Outcomes with the mechanism off and on, of each seed."""
 
 
@@ -340,7 +304,7 @@ def outside(nees_over_3: float) -> float:
     return max(_BAND[0] - value, value - _BAND[1], 0.0)
 
 
-def _means(outcomes: Sequence[Outcome], mode: str) -> Errors:
+def _means(outcomes: Sequence[Scores], mode: str) -> Errors:
     errors: list[Errors] = [getattr(o, mode) for o in outcomes]
     of_all = {name: float(np.mean([getattr(e, name) for e in errors])) for name in ("ate_mm", "yaw_deg", "nees_over_3")}
     return Errors(**of_all)
@@ -348,7 +312,7 @@ def _means(outcomes: Sequence[Outcome], mode: str) -> Errors:
 
 # --- Rows -------------------------------------------------------------------------------------------------------------
 
-Outcomes = Mapping[Cell, Outcome]
+Outcomes = Mapping[Cell, Scores]
 
 
 @dataclass(frozen=True, slots=True)
@@ -407,8 +371,8 @@ def wanted(scope: Scope) -> Iterator[Wanted]:
     for case in scope.cases:
         cells = scope.cells(case)
         for mode in MODES:
-            yield Wanted(f"{case}.{mode}.nees_over_3", cells, _figure(cells, mode, "nees_over_3", ""))
-            yield Wanted(f"{case}.{mode}.ate_mm", cells, _figure(cells, mode, "ate_mm", "mm"))
+            for figure, unit in (("nees_over_3", ""), ("ate_mm", "mm")):
+                yield Wanted(f"{case}.{mode}.{figure}", cells, _figure(cells, of_errors(mode, figure), unit))
     slips = tuple(cell for case in SLIP_CASES if case in scope.cases for cell in scope.cells(case))
     yield Wanted("motion.delay_s", slips, lambda name, found: _delay(name, [found[c] for c in slips]))
     yield Wanted("motion.false_per_km", slips, lambda name, found: _false(name, [found[c] for c in slips]))
@@ -438,37 +402,31 @@ def of_one(scope: Scope, mechanism: Mechanism, case: str, label: str = "") -> It
         for row_id, figure in (("ate_ratio", "ate_mm"), ("nees_over_3", "nees_over_3")):
 
             def row(name: str, found: Outcomes, mode: str = mode, figure: str = figure) -> Row:
-                return ratio(name, [found[c] for c in off], [found[c] for c in on], mode, figure)
+                return ratio_of(name, [found[c] for c in off], [found[c] for c in on], of_errors(mode, figure))
 
             yield Wanted(f"off.{label or mechanism.name}.{case}.{mode}.{row_id}", (*off, *on), row)
 
 
-def _figure(cells: Sequence[Cell], mode: str, figure: str, unit: str) -> Callable[[str, Outcomes], Row]:
-    def row(name: str, found: Outcomes) -> Row:
-        outcomes = [found[c] for c in cells]
-        errors: list[Errors | None] = [getattr(o, mode) for o in outcomes]
-        values = [getattr(e, figure) for e in errors if e is not None]
-        return mean(name, values, unit) if len(values) == len(cells) else failed(name, outcomes)
-
-    return row
+def _figure(cells: Sequence[Cell], figure: Figure, unit: str) -> Callable[[str, Outcomes], Row]:
+    return lambda name, found: mean_of(name, [found[c] for c in cells], figure, unit)
 
 
-def _delay(name: str, outcomes: Sequence[Outcome]) -> Row:
-    delays = [d for o in outcomes for d in o.delays_s]
+def _delay(name: str, outcomes: Sequence[Scores]) -> Row:
+    delays = [d for o in outcomes for d in o.slips.delays_s]
     if not delays:
         return Row(name, None, n=0, reason="no slip was found")
     return Row(name, float(np.median(delays)), float(np.std(delays)), len(delays), "s")
 
 
-def _false(name: str, outcomes: Sequence[Outcome]) -> Row:
-    km = sum(o.path_m for o in outcomes) / 1000.0
-    alarms = sum(o.false_alarms for o in outcomes)
+def _false(name: str, outcomes: Sequence[Scores]) -> Row:
+    km = sum(o.slips.path_m for o in outcomes) / 1000.0
+    alarms = sum(o.slips.false_alarms for o in outcomes)
     return Row(name, alarms / km, None, len(outcomes), "1/km") if km else Row(name, None, n=0, reason="no way")
 
 
-def _recall(name: str, outcomes: Sequence[Outcome]) -> Row:
-    found = [m for o in outcomes for m in o.found_m if m >= _LEAST_M]
-    n = len(found) + sum(m >= _LEAST_M for o in outcomes for m in o.missed_m)
+def _recall(name: str, outcomes: Sequence[Scores]) -> Row:
+    found = [m for o in outcomes for m in o.slips.found_m if m >= _LEAST_M]
+    n = len(found) + sum(m >= _LEAST_M for o in outcomes for m in o.slips.missed_m)
     return Row(name, len(found) / n, None, n) if n else Row(name, None, n=0, reason="no slip of 3 cm")
 
 
@@ -507,20 +465,6 @@ def mean(row_id: str, values: Sequence[float], unit: str = "") -> Row:
     if not values:
         return Row(row_id, None, n=0, reason="nothing was run")
     return mean_row(row_id, values, unit)
-
-
-def failed(row_id: str, outcomes: Sequence[Outcome]) -> Row:
-    """A row without a value, with the reason."""
-    why = [o.failed for o in outcomes if o.failed]
-    return Row(row_id, None, n=len(outcomes), reason=f"in {len(why)} of {len(outcomes)} runs: {why[0] if why else '-'}")
-
-
-def ratio(row_id: str, off: Sequence[Outcome], on: Sequence[Outcome], mode: str, figure: str) -> Row:
-    """Mean with the mechanism off over that with it on; the spread is that of the ratios of single runs."""
-    missing = [o for o in (*off, *on) if o.failed or getattr(o, mode) is None]
-    if missing:
-        return failed(row_id, [*off, *on])
-    return ratio_row(row_id, *([getattr(getattr(o, mode), figure) for o in of_all] for of_all in (off, on)))
 
 
 # --- The table for the reader -----------------------------------------------------------------------------------------

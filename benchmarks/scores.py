@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Self
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
+from benchmarks.common import Row, mean_row, ratio_row
 from benchmarks.recordings import Recorded, slip_intervals
+from benchmarks.replays import Replayed, kept
 from fgloc.config import Config
 from fgloc.estimation.log import OVERRULED
 from fgloc.estimation.motion import KNOWN
@@ -44,45 +48,104 @@ class Errors:
 
 
 @dataclass(frozen=True, slots=True)
+class Slips:
+    """Detections of the slip detector in one run.
+
+    Attributes:
+        delays_s: from the true onset to the flag, of each slip that was found.
+        found_m: distance that the wheels slipped, of each slip that was found.
+        missed_m: likewise, of each that was not.
+        false_alarms: flags without any slip in the detector's window.
+        path_m: distance travelled.
+    """
+
+    delays_s: tuple[float, ...] = ()
+    found_m: tuple[float, ...] = ()
+    missed_m: tuple[float, ...] = ()
+    false_alarms: int = 0
+    path_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Scores:
     """Figures of one run, as they are kept.
 
     Attributes:
         online, batch: of the estimates as they were made and of the smoothed ones; None if there are none.
+        poses: number of estimates online.
         lost_share: of the poses, those of a robot that took itself for lost without cause.
         refused_share: of the sightings.
         update_ms: processor time of each update after the first pose.
         found: error and sigma of what was found of the installation, by name; None if the run found nothing of it.
         map_over_survey: error of the markers' places over that of the survey.
         textbook_mm: mean distance from the truth of each textbook pipeline, by name.
+        named, moved: landmarks that the notes of the run name as moved, and those that were moved.
+        wrong_names: landmarks and faults of wheels that are named although they are not there.
+        missed_names: those that are there and not named.
+        slips: those that were found.
+        lifted_nees: NEES/3 while a robot was carried and until it saw a marker again; None without a kidnapping.
+        acted: how often each mechanism acted, by name; of the run with all of them on.
         failed: why there are no figures.
         batch_failed: why the run could not be smoothed.
     """
 
     online: Errors | None = None
     batch: Errors | None = None
+    poses: int = 0
     lost_share: float = math.nan
     refused_share: float = math.nan
     update_ms: tuple[float, ...] = ()
     found: dict[str, tuple[float, float]] | None = None
     map_over_survey: float | None = None
     textbook_mm: dict[str, float] = field(default_factory=dict)
+    named: tuple[int, ...] = ()
+    moved: tuple[int, ...] = ()
+    wrong_names: int = 0
+    missed_names: int = 0
+    slips: Slips = Slips()
+    lifted_nees: float | None = None
+    acted: dict[str, int] = field(default_factory=dict)
     failed: str = ""
     batch_failed: str = ""
 
-    def as_json(self) -> dict[str, Any]:
-        """Scores as values for JSON, which `from_json` reads."""
-        return asdict(self)
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Scores from values of JSON."""
-        told = dict(content)
-        for name in ("online", "batch"):
-            told[name] = None if told[name] is None else Errors(**told[name])
-        if told["found"] is not None:
-            told["found"] = {name: (error, sigma) for name, (error, sigma) in told["found"].items()}
-        return cls(**(told | {"update_ms": tuple(told["update_ms"])}))
+_SCORES = TypeAdapter(Scores)
+
+
+def kept_scores(name: str, make: Callable[[], Scores], *sources: Path) -> Scores:
+    """Scores of a cell, from the cache or made now; arguments as those of `benchmarks.replays.kept`."""
+    return _SCORES.validate_python(kept(name, lambda: asdict(make()), *sources))
+
+
+Figure = Callable[[Scores], float | None]
+
+
+def of_errors(mode: str, name: str) -> Figure:
+    """Figure: one of `Errors`, ``online`` or ``batch``."""
+    return lambda scores: None if (found := getattr(scores, mode)) is None else getattr(found, name)
+
+
+def figures(row_id: str, scores: Sequence[Scores], figure: Figure) -> tuple[list[float], Row | None]:
+    """The figure of each run; and a row that says why there is none, if one is missing."""
+    values = [None if s.failed else figure(s) for s in scores]
+    known = [v for v in values if v is not None and math.isfinite(v)]
+    if len(known) == len(scores):
+        return known, None
+    missing = [s for s, v in zip(scores, values, strict=True) if v is None or not math.isfinite(v)]
+    why = next((said for s in missing if (said := s.failed or s.batch_failed)), "the run says nothing of it")
+    return known, Row(row_id, None, n=len(scores), reason=f"in {len(missing)} of {len(scores)} runs: {why}")
+
+
+def mean_of(row_id: str, scores: Sequence[Scores], figure: Figure, unit: str = "") -> Row:
+    """Mean and standard deviation of a figure over the runs."""
+    values, missing = figures(row_id, scores, figure)
+    return missing or mean_row(row_id, values, unit)
+
+
+def ratio_of(row_id: str, scores: Sequence[Scores], over: Sequence[Scores], figure: Figure) -> Row:
+    """Mean of a figure over that of other runs; the spread is that of the ratios of single runs."""
+    (values, missing), (others, also) = (figures(row_id, runs, figure) for runs in (scores, over))
+    return missing or also or ratio_row(row_id, values, others)
 
 
 # --- The trajectory ---------------------------------------------------------------------------------------------------
@@ -128,26 +191,19 @@ def refused_share(decisions: Sequence[Decision]) -> float:
     return float(np.mean(refused)) if refused else math.nan
 
 
+def trajectory_scores(made: Replayed, config: Config, unknown_ns: tuple[int, int] | None) -> Scores:
+    """Scores of the trajectories of a run, and of what it refused; arguments as those of `errors`."""
+    online, batch = made.online, made.batch
+    return Scores(
+        online=errors(online, config, unknown_ns),
+        batch=None if batch is None else errors(batch, config, unknown_ns),
+        poses=len(online.trajectory),
+        lost_share=lost_share(online.modes, online.trajectory.stamps_ns, unknown_ns),
+        refused_share=refused_share(online.decisions),
+    )
+
+
 # --- Slips and moved landmarks ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Slips:
-    """Detections of the slip detector in one run.
-
-    Attributes:
-        delays_s: from the true onset to the flag, of each slip that was found.
-        found_m: distance that the wheels slipped, of each slip that was found.
-        missed_m: likewise, of each that was not.
-        false_alarms: flags without any slip in the detector's window.
-        path_m: distance travelled.
-    """
-
-    delays_s: tuple[float, ...]
-    found_m: tuple[float, ...]
-    missed_m: tuple[float, ...]
-    false_alarms: int
-    path_m: float
 
 
 def slips(recorded: Recorded, online: RunResult) -> Slips:

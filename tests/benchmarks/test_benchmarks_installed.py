@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks import installed
+from benchmarks import installed, replays
 from benchmarks.installed import CASES, Cell
 from benchmarks.recordings import Take
 from benchmarks.replays import floor
 from benchmarks.scores import (
     Errors,
     Scores,
+    Slips,
     errors,
     found_errors,
     inside,
+    kept_scores,
     lost_share,
     map_over_survey,
     places_in,
@@ -76,7 +77,7 @@ def landmark_map(**shifts):
 
 
 def scores(ate=1.0, batch=1.0, nees=1.0, **changes):
-    return Scores(Errors(ate, 0.1, nees), Errors(batch, 0.1, nees), 0.0, 0.0, (1.0, 2.0), **changes)
+    return Scores(Errors(ate, 0.1, nees), Errors(batch, 0.1, nees), 100, 0.0, 0.0, (1.0, 2.0), **changes)
 
 
 def decision(kind, reason=""):
@@ -141,10 +142,14 @@ def test_markers_of_which_nothing_is_said_stay_where_the_survey_has_them():
     assert map_over_survey(places, landmark_map(), INSTALLED) is None
 
 
-def test_scores_come_back_from_json_as_they_were():
-    made = scores(found={"camera.yaw": (0.1, 0.2)}, textbook_mm={"corners": 3.0}, failed="no")
-    assert Scores.from_json(json.loads(json.dumps(made.as_json()))) == made
-    none = Scores.from_json(json.loads(json.dumps(Scores().as_json())))
+def test_scores_come_back_from_the_cache_as_they_were(tmp_path, monkeypatch):
+    monkeypatch.setattr(replays, "cache_folder", lambda: tmp_path)
+    slips = Slips((0.2,), (0.05,), (), 1, 3.0)
+    made = scores(found={"camera.yaw": (0.1, 0.2)}, textbook_mm={"corners": 3.0}, slips=slips, moved=(3,), failed="no")
+    kept_scores("made", lambda: made)
+    kept_scores("none", Scores)
+    assert kept_scores("made", Scores) == made
+    none = kept_scores("none", lambda: made)
     assert none.online is None
     assert math.isnan(none.lost_share)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,20 +14,18 @@ from benchmarks import mechanisms
 from benchmarks.common import Row
 from benchmarks.mechanisms import (
     Cell,
-    Outcome,
     Scope,
     changes,
     file_name,
     mechanism_of,
     outcome,
     outside,
-    ratio,
     report,
     wanted,
     without_effect,
 )
 from benchmarks.mechanisms_off import BY_NAME, MECHANISMS, Returns, Switch, watched
-from benchmarks.scores import Errors
+from benchmarks.scores import Errors, Scores, Slips, of_errors, ratio_of
 from fgloc.estimation import place as place_search
 from fgloc.estimation import sightings as association
 from fgloc.estimation.sightings import Association
@@ -50,7 +48,7 @@ def refusals(world):
 def result(ate=1.0, nees=1.0, batch=None, **changes_):
     errors = Errors(ate, 0.1, nees)
     smoothed = None if batch is None else Errors(batch, 0.1, 1.0)
-    return Outcome(errors, smoothed, 100, **changes_)
+    return Scores(errors, smoothed, 100, **changes_)
 
 
 def scope(*names):
@@ -116,9 +114,9 @@ def test_a_mechanism_that_does_not_act_is_not_run(monkeypatch):
 
     def kept(name, make, *sources):
         asked.append(name)
-        return asdict(on if "_on_" in name else result(2.0))
+        return on if "_on_" in name else result(2.0)
 
-    monkeypatch.setattr("benchmarks.mechanisms.kept", kept)
+    monkeypatch.setattr("benchmarks.mechanisms.kept_scores", kept)
     assert outcome(Cell(3, "none", "misread_ids")) == on
     assert outcome(Cell(3, "none", "doubtful_wheels")).online.ate_mm == 2.0
     assert outcome(Cell(3, "none", "gate")).online.ate_mm == 2.0
@@ -148,7 +146,7 @@ def test_a_change_counts_where_it_is_large_enough():
     assert worse(result(nees=1.6), result()) == {"online.nees"} == worse(result(nees=0.5), result())
     assert better(result(nees=2.0), result(nees=4.0)) == {"online.nees"}
     assert worse(result(wrong_names=1), result()) == {"names"} == better(result(), result(missed_names=1))
-    assert worse(Outcome(failed="lost"), result()) == {"failed"}
+    assert worse(Scores(failed="lost"), result()) == {"failed"}
     assert worse(result(lifted_nees=60.0), result(lifted_nees=1.0)) == {"nees_while_lifted"}
     assert worse(result(lifted_nees=60.0), result()) == set()
     assert worse(replace(result(), poses=90), result()) == {"poses"}
@@ -158,15 +156,15 @@ def test_a_change_counts_where_it_is_large_enough():
 
 def test_rows_are_ratios_of_means_and_those_without_value_say_why():
     off, on = [result(4.0), result(2.0)], [result(1.0), result(2.0)]
-    assert ratio("a", off, on, "online", "ate_mm") == Row("a", 2.0, 1.5, 2)
-    row = ratio("a", [Outcome(failed="lost"), result()], on, "online", "ate_mm")
+    assert ratio_of("a", off, on, of_errors("online", "ate_mm")) == Row("a", 2.0, 1.5, 2)
+    row = ratio_of("a", [Scores(failed="lost"), result()], on, of_errors("online", "ate_mm"))
     assert row.value is None
     assert "lost" in row.reason
 
 
 def test_the_table_is_well_formed_and_names_what_has_no_effect():
     chosen = scope("gate", "start_trimming", "misread_ids")
-    on = result(batch=1.0, acted={"gate": 1}, delays_s=(0.2,), found_m=(0.05,), missed_m=(0.04, 0.01), path_m=500.0)
+    on = result(batch=1.0, acted={"gate": 1}, slips=Slips((0.2,), (0.05,), (0.04, 0.01), path_m=500.0))
     found = found_in(chosen, on, result(batch=1.0))
     rows = [w.row(w.id, found) for w in wanted(chosen) if w.cells]
     assert len({row.id for row in rows}) == len(rows)
@@ -180,7 +178,6 @@ def test_the_table_is_well_formed_and_names_what_has_no_effect():
     found = found_in(chosen, on, result(1.2, batch=0.5))
     assert without_effect(chosen, found) == []
     assert "none.online.ate: 1 -> 1.2" in report(chosen, found)
-    assert Outcome.from_json(asdict(on)) == on
 
 
 def test_a_mechanism_is_taken_away_where_it_is_for_something_and_elsewhere_only_if_nothing_gets_worse_there(
