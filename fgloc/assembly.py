@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fgloc.config import Config
 from fgloc.diagnosis.handling import FloorWatch
-from fgloc.diagnosis.mistakes import Diagnoses, Diagnosis, diagnosis_of
+from fgloc.diagnosis.mistakes import Diagnosis
 from fgloc.diagnosis.sanity import Sanity
 from fgloc.estimation.localizer import Localizer
 from fgloc.intake.keyframing import KeyframeBuilder
@@ -40,7 +40,7 @@ class Assembly:
     learned: LearnedMotion | None
     sensors: tuple[Sensor, ...]
     localizer: Localizer
-    diagnosis: Diagnosis | Diagnoses
+    diagnosis: Diagnosis
     sanity: Sanity
     notes: tuple[str, ...]
 
@@ -128,7 +128,7 @@ def _assembled(setup: SensorSetup, keep_all: bool, causal: bool = True) -> Assem
         learned=learned,
         sensors=sensors,
         localizer=Localizer(config, landmark_map, motion, PoseSensors(landmarks, sensors), keep_all),
-        diagnosis=diagnosis_of(config, landmark_map, cameras, setup.T_base_sensor, setup.imu_up, floor),
+        diagnosis=Diagnosis(config, landmark_map, cameras, setup.T_base_sensor, setup.imu_up, floor),
         sanity=Sanity(config, landmark_map, cameras, setup.T_base_sensor, wheels, watched_gyro),
         notes=setup.notes,
     )

@@ -385,10 +385,100 @@ _SPARSE_S = 0.09  # images closer than this to the one before add little informa
 class Diagnosis:
     """Signals of a run, collected in bounded memory and independently of the estimator.
 
-    Corners of markers are compared as points in the camera's axes.
+    Each of several cameras is compared by itself, with the same signals of motion.
+    """
 
-    Attributes:
-        found: by the last comparison; of little motion, by the last two alike.
+    def __init__(
+        self,
+        config: Config,
+        landmark_map: LandmarkMap | None,
+        cameras: Sequence[Camera] = (),
+        T_base_sensor: FloatArray | None = None,
+        imu_up: FloatArray | None = None,
+        floor: FloorWatch | None = None,
+    ) -> None:
+        """Set up for the sensors of a run.
+
+        Args:
+            config: as the run uses it.
+            landmark_map: the known map; None if landmarks are estimated.
+            cameras: of corners.
+            T_base_sensor: ``(4, 4)`` of a sensor that reports ranges or marker poses, as `LandmarkSensor` takes it.
+            imu_up: ``(3,)`` the base's z axis in the IMU's frame; None: there is no gyro.
+            floor: watches whether it is flat; None: it may be as it is.
+        """
+        self._floor, self._moving_s = floor, 0.0
+        self._camera_of = {topic: camera.name for camera in cameras if camera.name for topic in camera.topics}
+        self._compared = {
+            "" if camera is None else camera.name: _Compared(
+                config if camera is None else config.of_camera(camera.name), landmark_map, camera, T_base_sensor, imu_up
+            )
+            for camera in cameras or (None,)
+        }
+
+    @property
+    def found(self) -> tuple[Finding, ...]:
+        """Findings of the last comparison; of little motion, of the last two alike."""
+        return ordered([f for name, one in self._compared.items() for f in of_camera(one.found, name)])
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """Sentences on errors of the configuration that make the poses wrong: here, a floor that is not flat."""
+        sentence = None if self._floor is None else self._floor.sentence
+        return () if sentence is None else (sentence,)
+
+    def add(self, event: Event) -> None:
+        """Store the signals of an event before the gate, which may refuse it because of another unit."""
+        of = self._camera_of.get(event.topic)
+        for name, one in self._compared.items():
+            if of in (None, name):
+                one.add(event)
+
+    def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
+        """Watch the floor over a step.
+
+        Args:
+            step: as the localizer got it.
+            by_hand: a person has the robot in hand.
+            motion: ``(3,)`` by the wheels, which tells how much of the signals is of a robot in motion.
+        """
+        if self._floor is not None:
+            self._floor.observe(step, by_hand)
+        if motion is not None and (
+            math.hypot(motion[0], motion[1]) > _MOVES_M_S * step.dt or abs(motion[2]) > _MOVES_RAD_S * step.dt
+        ):
+            self._moving_s += step.dt
+
+    def findings(self, ended: bool = True) -> tuple[Finding, ...]:
+        """Findings: signals of the sensors that do not fit together, each with its remedy.
+
+        Args:
+            ended: compare all signals; otherwise only once they are many more than those compared before.
+        """
+        comparison = self.comparison(ended)
+        if comparison is not None:
+            comparison()
+        return self.found
+
+    def comparison(self, ended: bool = False) -> Callable[[], None] | None:
+        """A comparison to be made by any thread, of the signals so far; it sets `found`.
+
+        Args:
+            ended: as `findings` has it. None is given where no comparison is due.
+        """
+        due = [made for one in self._compared.values() if (made := one.comparison(ended, self._moving_s)) is not None]
+
+        def compare() -> None:
+            for made in due:
+                made()
+
+        return compare if due else None
+
+
+class _Compared:
+    """Signals of a run with one camera or none, and what the last comparison found.
+
+    Corners of markers are compared as points in the camera's axes.
     """
 
     def __init__(
@@ -398,19 +488,8 @@ class Diagnosis:
         camera: Camera | None,
         T_base_sensor: FloatArray | None,
         imu_up: FloatArray | None,
-        floor: FloorWatch | None = None,
     ) -> None:
-        """Set up for the sensors of a run.
-
-        Args:
-            config: as the run uses it.
-            landmark_map: the known map; None if landmarks are estimated.
-            camera: of corners; None if there is none.
-            T_base_sensor: ``(4, 4)`` of a sensor that reports ranges or marker poses, as `LandmarkSensor` takes it.
-            imu_up: ``(3,)`` the base's z axis in the IMU's frame; None: there is no gyro.
-            floor: watches whether it is flat; None: it may be as it is.
-        """
-        self._floor, self._camera, self._map, self._up = floor, camera, landmark_map, imu_up
+        self._camera, self._map, self._up = camera, landmark_map, imu_up
         self._config, self._place = config, T_base_sensor
         if camera is not None:
             self._config = with_values(config, "recording", {"sightings_axes": "optical"})
@@ -420,12 +499,11 @@ class Diagnosis:
         self._signals = SignalCollector(config)
         self._began_ns: int | None = None
         self._span_s, self._looked_s, self._compared_s = 0.0, -math.inf, 0.0
-        self._moving_s, self._compared_moving_s = 0.0, 0.0
+        self._compared_moving_s = 0.0
         self._codes: set[str] = set()  # found by the last comparison
         self.found: tuple[Finding, ...] = ()
 
     def add(self, event: Event) -> None:
-        """Store the signals of an event before the gate, which may refuse it because of another unit."""
         self._began_ns = event.received_ns if self._began_ns is None else self._began_ns
         if not self._signals.add(event):
             return
@@ -447,53 +525,16 @@ class Diagnosis:
         found = ((s.landmark_id, marker_pose_candidates(camera, s.corners_px, size)) for s in seen)
         return [(i, poses[0][0][:3, 3]) for i, poses in found if poses]
 
-    def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
-        """Watch the floor over a step.
-
-        Args:
-            step: as the localizer got it.
-            by_hand: a person has the robot in hand.
-            motion: ``(3,)`` by the wheels, which tells how much of the signals is of a robot in motion.
-        """
-        if self._floor is not None:
-            self._floor.observe(step, by_hand)
-        if motion is not None and (
-            math.hypot(motion[0], motion[1]) > _MOVES_M_S * step.dt or abs(motion[2]) > _MOVES_RAD_S * step.dt
-        ):
-            self._moving_s += step.dt
-
-    @property
-    def mistakes(self) -> tuple[str, ...]:
-        """Sentences on errors of the configuration that make the poses wrong: here, a floor that is not flat."""
-        sentence = None if self._floor is None else self._floor.sentence
-        return () if sentence is None else (sentence,)
-
-    def findings(self, ended: bool = True) -> tuple[Finding, ...]:
-        """Findings: signals of the sensors that do not fit together, each with its remedy.
-
-        Args:
-            ended: compare all signals; otherwise only once they are many more than those compared before.
-        """
-        comparison = self.comparison(ended)
-        if comparison is not None:
-            comparison()
-        return self.found
-
-    def comparison(self, ended: bool = False) -> Callable[[], None] | None:
-        """A comparison to be made by any thread, of the signals so far; it sets `found`.
-
-        Args:
-            ended: as `findings` has it. None is given where no comparison is due.
-        """
+    def comparison(self, ended: bool, moving_s: float) -> Callable[[], None] | None:
         growth = _GROWTH_MOVING if self._compared_moving_s < _FIRST_S else _GROWTH
         enough = self._span_s >= max(_FIRST_S, _GROWTH * self._compared_s)
-        enough |= self._moving_s >= max(_FIRST_MOVING_S, growth * self._compared_moving_s)
+        enough |= moving_s >= max(_FIRST_MOVING_S, growth * self._compared_moving_s)
         if self._span_s <= self._compared_s or not (ended or enough):
             return None
-        self._compared_s, self._compared_moving_s = self._span_s, self._moving_s
+        self._compared_s, self._compared_moving_s = self._span_s, moving_s
         now = self._signals.found
         signals = replace(now, **{f.name: copy.copy(getattr(now, f.name)) for f in fields(now)})
-        little = not ended and 0.0 < self._moving_s < _FIRST_S
+        little = not ended and 0.0 < moving_s < _FIRST_S
         return lambda: self._compare(signals, little)
 
     def _compare(self, signals: Signals, little: bool) -> None:
@@ -519,71 +560,6 @@ class Diagnosis:
             said = finding.text.partition(": set ")[0].removesuffix(".")
             text = f"{said}; a wrong size of the markers or focal length does the same: measure them."
             yield replace(finding, text=text, lines={}, severity=severity)
-
-
-class Diagnoses:
-    """`Diagnosis` of each of several cameras, with the same signals of motion."""
-
-    def __init__(self, named: Mapping[str, Diagnosis], topics: Mapping[str, str]) -> None:
-        """Take the diagnosis of each camera by its name, and the camera of each topic."""
-        self._named, self._topics = named, topics
-
-    @property
-    def found(self) -> tuple[Finding, ...]:
-        """Findings of all, each once."""
-        return ordered([f for name, one in self._named.items() for f in of_camera(one.found, name)])
-
-    @property
-    def mistakes(self) -> tuple[str, ...]:
-        """Sentences on errors of the configuration that make the poses wrong."""
-        return tuple(dict.fromkeys(m for one in self._named.values() for m in one.mistakes))
-
-    def add(self, event: Event) -> None:
-        """Store the signals of an event: of a camera with its own, of all else with each."""
-        of = self._topics.get(event.topic)
-        for name, one in self._named.items():
-            if of in (None, name):
-                one.add(event)
-
-    def observe(self, step: Step, by_hand: bool = False, motion: FloatArray | None = None) -> None:
-        """Watch the floor over a step; see `Diagnosis.observe`."""
-        for one in self._named.values():
-            one.observe(step, by_hand, motion)
-
-    def findings(self, ended: bool = True) -> tuple[Finding, ...]:
-        """Findings of all; see `Diagnosis.findings`."""
-        comparison = self.comparison(ended)
-        if comparison is not None:
-            comparison()
-        return self.found
-
-    def comparison(self, ended: bool = False) -> Callable[[], None] | None:
-        """A comparison of all whose is due; see `Diagnosis.comparison`."""
-        due = [c for one in self._named.values() if (c := one.comparison(ended)) is not None]
-
-        def compare() -> None:
-            for one in due:
-                one()
-
-        return compare if due else None
-
-
-def diagnosis_of(
-    config: Config,
-    landmark_map: LandmarkMap | None,
-    cameras: Sequence[Camera],
-    T_base_sensor: FloatArray | None,
-    imu_up: FloatArray | None,
-    floor: FloorWatch | None,
-) -> Diagnosis | Diagnoses:
-    """Diagnosis of a run with these cameras; the arguments are those of `Diagnosis`."""
-    if not any(camera.name for camera in cameras):
-        return Diagnosis(config, landmark_map, cameras[0] if cameras else None, T_base_sensor, imu_up, floor)
-    named: dict[str, Diagnosis] = {}
-    for camera in cameras:
-        own = config.of_camera(camera.name)
-        named[camera.name] = Diagnosis(own, landmark_map, camera, T_base_sensor, imu_up, None if named else floor)
-    return Diagnoses(named, {topic: camera.name for camera in cameras for topic in camera.topics})
 
 
 # --- After a run ------------------------------------------------------------------------------------------------------

@@ -111,7 +111,8 @@ def events(landmark_map, corners=False, seed=0, wheels_late=0.0, gyro_late=None,
 
 def diagnose(made, landmark_map, camera=None, settings=None, place=None) -> dict[str, Finding]:
     """Findings of a diagnosis of these events, by code."""
-    diagnosis = Diagnosis(settings or config(), landmark_map, camera, place, np.array([0.0, 0.0, 1.0]))
+    cameras = () if camera is None else (camera,)
+    diagnosis = Diagnosis(settings or config(), landmark_map, cameras, place, np.array([0.0, 0.0, 1.0]))
     for event in made:
         diagnosis.add(event)
     return {finding.code: finding for finding in diagnosis.findings()}
@@ -312,7 +313,7 @@ def test_fault_52_all_map_poses_shifted_against_the_given_first_pose():
 
 
 def test_a_live_run_is_compared_as_its_signals_grow():
-    diagnosis = Diagnosis(config(), beacons(), None, None, None)
+    diagnosis = Diagnosis(config(), beacons())
     made = events(beacons(), late=DELTA)
     found = []
     for event in made:

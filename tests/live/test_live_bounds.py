@@ -79,7 +79,7 @@ def test_joints_and_topics_of_ever_new_names_make_few_notes_and_statistics():
 
 def test_a_stamp_of_another_age_does_not_end_the_comparison_of_sensors():
     world = World(beacons(), seed=2, seconds=10.0)
-    compared = Diagnosis(config(), world.map, None, np.eye(4), None)
+    compared = Diagnosis(config(), world.map, (), np.eye(4))
     for k, event in enumerate(world.events()):
         compared.add(event)
         if k > 50 and isinstance(event, OdometryEvent):

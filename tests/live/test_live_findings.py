@@ -66,7 +66,7 @@ def named(live, code: str) -> Finding | None:
 
 def test_however_long_the_robot_stood_it_takes_twenty_seconds_of_motion_at_most():
     stands_s = 21.0  # a comparison while it stands tells nothing, and the next by time alone comes after 40 s
-    diagnosis = Diagnosis(config(), beacons(), None, None, None)
+    diagnosis = Diagnosis(config(), beacons())
     made = swerving(stands_s, 16.0)
     for k, event in enumerate(map(mirrored, made)):
         diagnosis.add(event)
@@ -90,7 +90,7 @@ def test_each_event_is_compared_once(monkeypatch):
 
 
 def test_signals_are_compared_once_they_are_many_more_than_before_and_at_the_end():
-    diagnosis, due = Diagnosis(config(), beacons(), None, None, None), []
+    diagnosis, due = Diagnosis(config(), beacons()), []
     for event in swerving(seconds=50.0):
         diagnosis.add(event)
         if diagnosis.comparison() is not None:
