@@ -15,6 +15,7 @@ from fgloc import se2
 from fgloc.config import WheelsConfig
 from fgloc.sensors.failures import Carriage, EventFailure, Failure, Scene
 from fgloc.sensors.wheels.events import JointsEvent, OdometryEvent, PoseAndTwistEvent
+from fgloc.sensors.wheels.naming import by_side
 from fgloc.types import Event, FloatArray
 
 
@@ -243,11 +244,9 @@ class _Encoders:
 
     def _indices(self, event: JointsEvent) -> list[int] | None:
         """Places of the left and of the right wheel in the message; None if it does not hold both."""
-        found = []
-        for name, side in zip(self._wanted, ("left", "right"), strict=True):
-            fits = [i for i, n in enumerate(event.names) if (n == name if name else side in n.lower())]
-            found += fits[:1]
-        return found if len(found) == 2 else None
+        sides = zip(self._wanted, by_side(event.names), strict=True)
+        pair = [given or next(iter(named), "") for given, named in sides]
+        return [event.names.index(name) for name in pair] if {*pair} <= {*event.names} else None
 
 
 class EncoderFrozen(Failure):

@@ -14,8 +14,8 @@ import numpy as np
 from fgloc import se2
 from fgloc.config import WheelsConfig
 from fgloc.sensors.base import FoundRow, InstallationState, MotionInstallation, Parameter, Rank
-from fgloc.sensors.wheels.driven import DriveTrack
-from fgloc.sensors.wheels.tracks import CommandTrack, OdometryTrack, TicksTrack, Track, TwistTimeline
+from fgloc.sensors.wheels.driven import DriveTrack, TicksTrack
+from fgloc.sensors.wheels.tracks import CommandTrack, OdometryTrack, Track, TwistTimeline
 from fgloc.types import FloatArray, MotionMeasurement, Setting, Step
 
 if TYPE_CHECKING:

@@ -22,6 +22,10 @@ _LEFT, _RIGHT = (
     re.compile(r"(?<![a-z])(right|fr|rr|br)(?![a-z])", re.I),
 )
 _BEHIND = re.compile(r"(?<![a-z])(rear|back|left|right|rl|rr|bl|br)(?![a-z])", re.I)  # of a wheel that does not steer
+_SIDES = (
+    re.compile(r"(?<![a-z])(left|l)(?![a-z])|left.*wheel|wheel.*left", re.I),
+    re.compile(r"(?<![a-z])(right|r)(?![a-z])|right.*wheel|wheel.*right", re.I),
+)
 _STEERING = re.compile(r"steer", re.I)
 _DIAGONAL = 0.1  # share of four wheels' motion in which diagonal ones turn alike, against the others: rollers
 _SIDE = 0.02  # likewise that tells wheels of one side from one another: below it they turn alike
@@ -44,6 +48,12 @@ class NamedDrive:
     kind: str
     why: str
     lines: tuple[str, ...]
+
+
+def by_side(names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Names of the left and of the right: those that hold the word or the letter by itself, a wheel's also within."""
+    left, right = ({name for name in names if side.search(name)} for side in _SIDES)
+    return [name for name in names if name in left - right], [name for name in names if name in right - left]
 
 
 def joint_names(joints: Sequence[JointsEvent]) -> tuple[str, ...]:

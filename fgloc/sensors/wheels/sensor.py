@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -32,6 +31,7 @@ from fgloc.sensors.base import (
     with_values,
 )
 from fgloc.sensors.wheels import failures
+from fgloc.sensors.wheels.driven import wheel_names
 from fgloc.sensors.wheels.events import (
     JointsEvent,
     OdometryChecks,
@@ -43,8 +43,7 @@ from fgloc.sensors.wheels.events import (
     odometry_validator,
 )
 from fgloc.sensors.wheels.motion import INSTALLATION
-from fgloc.sensors.wheels.naming import TICKS, NamedDrive, count_ticks, joint_names, name_drive
-from fgloc.sensors.wheels.tracks import wheel_names
+from fgloc.sensors.wheels.naming import TICKS, NamedDrive, by_side, count_ticks, joint_names, name_drive
 from fgloc.types import ControlEvent, Event, FloatArray
 
 if TYPE_CHECKING:
@@ -96,8 +95,6 @@ CHANNELS = (
 )
 
 
-_LEFT = re.compile(r"(?<![a-z])(left|l)(?![a-z])", re.IGNORECASE)
-_RIGHT = re.compile(r"(?<![a-z])(right|r)(?![a-z])", re.IGNORECASE)
 _FEWEST = 50  # messages of each, for a fit
 _FITS = 0.98  # share of the odometry's variance that the wheels must explain
 _CAUCHY, _ITERATIONS = 3.5, 5  # median absolute deviations beyond which a residual counts less: 95 % efficiency
@@ -136,10 +133,7 @@ class WheelGeometry:
 
 def wheel_pair(names: Sequence[str]) -> WheelPair | None:
     """The joints that are the left and right wheel by their names; None if that is not clear."""
-    words = {name: name.replace("_", " ").replace("-", " ") for name in names}
-    wheels = [name for name in names if "wheel" in name.lower()] or list(names)
-    left = [name for name in wheels if _LEFT.search(words[name]) and not _RIGHT.search(words[name])]
-    right = [name for name in wheels if _RIGHT.search(words[name]) and not _LEFT.search(words[name])]
+    left, right = by_side([name for name in names if "wheel" in name.lower()] or names)
     return WheelPair(left[0], right[0]) if len(left) == len(right) == 1 else None
 
 
