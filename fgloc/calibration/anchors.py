@@ -22,20 +22,21 @@ from scipy.optimize import least_squares
 from fgloc import se2
 from fgloc.assembly import Assembly, assemble
 from fgloc.calibration.installation import Found, found_values
+from fgloc.calibration.survey import FREE, ORIGIN, check_flat
 from fgloc.config import Config, base_roles
 from fgloc.diagnosis.pairs import MAD
-from fgloc.errors import ConfigError, RecordingError
+from fgloc.errors import RecordingError
 from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.installation import InstallationEstimate, installation_of
 from fgloc.graph.measurement_log import Keyframe, MeasurementLog, PoseWithCovariance
 from fgloc.intake.validation import reported_bounds
 from fgloc.recording.reader import open_recording
-from fgloc.replay import Progress
+from fgloc.replay import Progress, Replay
 from fgloc.sensors.base import with_values
 from fgloc.sensors.learned.sensor import gains_of
 from fgloc.sensors.uwb import MOST_UNSURE, Uwb, UwbConfig, UwbEvent, UwbRange, check, noise_m, place_parameters
-from fgloc.types import FloatArray, Landmark, LandmarkMap
+from fgloc.types import Event, FloatArray, Landmark, LandmarkMap
 
 # --- The drive --------------------------------------------------------------------------------------------------------
 
@@ -79,24 +80,25 @@ def surveys_anchors(bag: Path, config: Config) -> bool:
 def _drive(bag: Path, config: Config, progress: Progress | None) -> _Drive:
     heard: list[UwbEvent] = []
     rejected: Counter[str] = Counter()
+    bounds = reported_bounds(config)
+
+    def without_ranges(events: Iterator[Event]) -> Iterator[Event]:
+        """Keep the ranges aside, and drop them where no anchor is known."""
+        for event in events:
+            if not isinstance(event, UwbEvent):
+                yield event
+                continue
+            checked = check(event, bounds)
+            if isinstance(checked, str):
+                rejected[checked] += 1
+            else:
+                heard.append(checked)
+            if parts.sensors:
+                yield event
+
     with open_recording(bag, config.recording) as recording:
         parts = assemble(recording, None, config, keep_all=True)
-        start_ns, bounds = recording.span_ns[0], reported_bounds(config)
-        for event in recording.events():
-            if progress is not None:
-                progress((event.received_ns - start_ns) * 1e-9, recording.duration_s)
-            if isinstance(event, UwbEvent):
-                checked = check(event, bounds)
-                if isinstance(checked, str):
-                    rejected[checked] += 1
-                else:
-                    heard.append(checked)
-                if not parts.sensors:
-                    continue
-            passed = parts.gate.check(event)
-            for step in () if passed is None else parts.stepper.push(passed):
-                parts.localizer.update(step)
-        for step in parts.stepper.flush():
+        for step in Replay(parts, recording, None, progress, {}).steps(without_ranges(recording.events())):
             parts.localizer.update(step)
         parts.localizer.finish(False)
         notes = [*recording.notes, *parts.gate.notes]
@@ -211,8 +213,6 @@ def _locate(tags: FloatArray, ranges: FloatArray, config: UwbConfig) -> _Place |
 # --- The graph --------------------------------------------------------------------------------------------------------
 
 _WIDE_M = 5.0  # sigma of x and y about an approximate place
-_FREE = np.diag(np.square([10.0, 10.0, 3.0]))  # of a first pose that anchors or positions place
-_ORIGIN = np.diag(np.square([1e-4, 1e-4, 1e-5]))  # of one that is the map's origin
 _ROUNDING_M = 1e-3  # least sigma of a place in a map
 _ROUNDS = 5  # of judging all ranges by the solution
 
@@ -268,12 +268,12 @@ class _Graph:
                     fits = place is None or off < _FITS * place.misfit
                     (kept if fits else later).append(moved)
             others = [s.measurement for s in frame.sightings if not isinstance(s.measurement, UwbRange)]
-            origin = _ORIGIN if n == 0 and not parts.sensors else _FREE
+            origin = ORIGIN if n == 0 and not parts.sensors else FREE
             log.keyframes[n] = Keyframe(
                 n,
                 frame.stamp_ns,
                 0.0,
-                PoseWithCovariance(pose, _FREE),
+                PoseWithCovariance(pose, FREE),
                 None if frame.prior is None else PoseWithCovariance(pose, origin),
                 frame.motions,
                 tuple(factors.sighting(n, m, m.cauchy_k) for m in (*kept, *others)),
@@ -360,11 +360,7 @@ def survey_anchors(bag: Path, config: Config, progress: Progress | None = None) 
     Raises:
         FglocError: the recording cannot be used, or no anchor can be placed.
     """
-    if config.estimator.ground != "flat":
-        raise ConfigError(
-            f"estimator.ground: {config.estimator.ground}: anchors are surveyed on a flat floor; drive where it is "
-            "flat and set estimator.ground: flat for the survey"
-        )
+    check_flat(config, "anchors")
     section: UwbConfig = config.uwb  # type: ignore[attr-defined]
     drive = _drive(bag, config, progress)
     heard = drive.of_anchors()

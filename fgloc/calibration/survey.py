@@ -29,13 +29,13 @@ from fgloc.graph.installation import Installation, InstallationEstimate, install
 from fgloc.graph.measurement_log import Keyframe, LoggedSighting, MeasurementLog, PoseWithCovariance
 from fgloc.graph.observation import Observations
 from fgloc.recording.reader import Recording, open_recording
-from fgloc.replay import Progress, smooth_run
+from fgloc.replay import Progress, Replay, smooth_run
 from fgloc.sensors.cameras import marker_pose_candidates
 from fgloc.sensors.equipment import LandmarkSensor, MotionCompensation, MotionSensors, PoseSensors
-from fgloc.sensors.markers.detector import detect_stream, fitting_dictionary
+from fgloc.sensors.markers.detector import fitting_dictionary
 from fgloc.sensors.measurements import PixelMeasurement, corners_of
 from fgloc.sensors.wheels.motion import WheelMotion
-from fgloc.types import Event, FloatArray, Landmark, LandmarkMap, RawEvent, SightingsEvent
+from fgloc.types import FloatArray, Landmark, LandmarkMap, SightingsEvent
 
 # --- Drives, replayed without a map -----------------------------------------------------------------------------------
 
@@ -113,15 +113,9 @@ def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
     with open_recording(bag, config.recording) as recording:
         _check(bag, recording, config)
         parts = assemble(recording, None, config, keep_all=True)
-        unreadable: Counter[str] = Counter()
         seen: Counter[int] = Counter()
-        for event in _checked(recording, parts, unreadable, progress):
-            if isinstance(event, SightingsEvent) and event.in_pixels:
-                seen.update(s.landmark_id for s in event.sightings)
-            parts.diagnosis.add(event)
-            for step in parts.stepper.push(event):
-                parts.localizer.update(step)
-        for step in parts.stepper.flush():
+        for step in Replay(parts, recording, parts.detector, progress, {}).steps(recording.events()):
+            seen.update(s.landmark_id for event in step.sightings if event.in_pixels for s in event.sightings)
             parts.localizer.update(step)
         parts.localizer.finish(False)
         notes = (*recording.notes, *parts.gate.notes)
@@ -131,29 +125,6 @@ def drive(bag: Path, config: Config, progress: Progress | None = None) -> Drive:
     estimates = smooth_run(parts).estimates
     frames = list(parts.localizer.estimator.log.keyframes.values())
     return Drive(bag, parts, frames, np.array([e.pose for e in estimates]), dict(sorted(seen.items())), notes)
-
-
-def _checked(
-    recording: Recording, parts: Assembly, unreadable: Counter[str], progress: Progress | None
-) -> Iterator[Event]:
-    """Events that passed the gate, images replaced by the corners of the markers in them."""
-
-    def gated() -> Iterator[Event]:
-        start_ns = recording.span_ns[0]
-        for event in recording.events():
-            if progress is not None:
-                progress((event.received_ns - start_ns) * 1e-9, recording.duration_s)
-            passed = parts.gate.check(event)
-            if passed is not None:
-                yield passed
-
-    if parts.detector is None:
-        yield from gated()
-        return
-    for event in detect_stream(gated(), parts.detector, unreadable):
-        passed = parts.detections.check(event) if isinstance(event, SightingsEvent) else event
-        if passed is not None and not isinstance(passed, RawEvent):
-            yield passed
 
 
 def _check(bag: Path, recording: Recording, config: Config) -> None:
@@ -169,6 +140,19 @@ def _check(bag: Path, recording: Recording, config: Config) -> None:
         raise ConfigError(
             f"{bag}: the distance of markers follows from their size: give the side of the black square in "
             "metres, --size 0.16, or markers.default_size_m in --config"
+        )
+
+
+def check_flat(config: Config, surveyed: str) -> None:
+    """Check that the floor is configured as flat.
+
+    Raises:
+        ConfigError: it is not; ``surveyed`` are markers or anchors.
+    """
+    if config.estimator.ground != "flat":
+        raise ConfigError(
+            f"estimator.ground: {config.estimator.ground}: {surveyed} are surveyed on a flat floor; drive where it is "
+            "flat and set estimator.ground: flat for the survey"
         )
 
 
@@ -427,8 +411,8 @@ def moved_by(landmark: Landmark, move: FloatArray) -> Landmark:
 # --- The graph --------------------------------------------------------------------------------------------------------
 
 _WIDE_M, _WIDE_RAD = 0.5, 0.5  # sigmas of an unknown marker: next to nothing is known of it
-_FREE = np.diag(np.square([10.0, 10.0, 3.0]))  # of the first pose of a drive that finds itself by the markers
-_ORIGIN = np.diag(np.square([1e-4, 1e-4, 1e-5]))  # of the one that is the map's origin
+FREE = np.diag(np.square([10.0, 10.0, 3.0]))  # of the first pose of a drive that finds itself by the markers
+ORIGIN = np.diag(np.square([1e-4, 1e-4, 1e-5]))  # of the one that is the map's origin
 _ROUNDS = 6
 _MOST_VIEWS = 100  # of a marker that decide which way round it is ...
 _DECIDED = 12.0  # ... if they are by this much likelier one way (twice the log of the likelihood)
@@ -611,7 +595,7 @@ class SurveyGraph:
                 prior = None
                 if frame.prior is not None:
                     origin = n == 0 and not leg.free
-                    prior = PoseWithCovariance(frame.prior.pose, _ORIGIN) if origin else PoseWithCovariance(pose, _FREE)
+                    prior = PoseWithCovariance(frame.prior.pose, ORIGIN) if origin else PoseWithCovariance(pose, FREE)
                 accepted: list[LoggedSighting] = []
                 rejected: list[LoggedSighting] = []
                 for m in seen:
@@ -621,7 +605,7 @@ class SurveyGraph:
                     k,
                     frame.stamp_ns,
                     0.0,
-                    PoseWithCovariance(pose, _FREE),
+                    PoseWithCovariance(pose, FREE),
                     prior,
                     frame.motions,
                     tuple(accepted),
@@ -679,11 +663,7 @@ def survey(
     Raises:
         FglocError: a recording cannot be used, nothing is seen often enough, or recordings have no marker in common.
     """
-    if config.estimator.ground != "flat":
-        raise ConfigError(
-            f"estimator.ground: {config.estimator.ground}: markers are surveyed on a flat floor; drive where it is "
-            "flat and set estimator.ground: flat for the survey"
-        )
+    check_flat(config, "markers")
     drives = [drive(bag, config, progress) for bag in bags]
     anchors = {i: m for i, m in (given.landmarks if given is not None else {}).items() if m.size_m > 0.0}
     seen = Counter({i: n for one in drives for i, n in one.sightings.items()})
