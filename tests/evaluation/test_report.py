@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from browser import Browser
-from run_results import figure_eight
+from run_results import REPORT_FILES, figure_eight
 
 from fgloc.cli.terminal import EXIT_LOST, exit_code
 from fgloc.config import Config
@@ -22,17 +22,6 @@ from fgloc.evaluation.report import plotly
 from fgloc.files.outputs import read_tum
 from fgloc.types import Mode, Protection, Trajectory
 
-FILES = {
-    "trajectory.tum",
-    "truth.tum",
-    "covariance.csv",
-    "steps.csv",
-    "metrics.json",
-    "config.json",
-    "trajectory.png",
-    "timeline.png",
-    "report.html",
-}
 KEYS = [
     "duration_s",
     "keyframes",
@@ -73,7 +62,7 @@ def written(tmp_path_factory):
 
 def test_all_files_are_written(written):
     _, out = written
-    assert {file.name for file in out.iterdir()} == FILES
+    assert {file.name for file in out.iterdir()} == REPORT_FILES
 
 
 def test_metrics_json_has_the_keys_of_the_contract(written):
@@ -276,10 +265,10 @@ def test_figures_are_written_in_the_formats_asked_for(tmp_path):
     result = figure_eight()
     report.write_results(result, CONFIG, tmp_path, COMMAND, figures=("svg",))
     names = {file.name for file in tmp_path.iterdir()}
-    assert names == FILES | {f"{n}.svg" for n in ("trajectory", "error", "timeline")}
+    assert names == REPORT_FILES | {f"{n}.svg" for n in ("trajectory", "error", "timeline")}
     assert "position" in (tmp_path / "trajectory.svg").read_text()  # text stays text
     report.write_results(result, CONFIG, tmp_path, COMMAND)
-    assert {file.name for file in tmp_path.iterdir()} == FILES
+    assert {file.name for file in tmp_path.iterdir()} == REPORT_FILES
 
 
 def colored(picture):
@@ -318,7 +307,7 @@ def test_report_tells_all_and_escapes(written):
 def test_results_are_the_same_twice(written, tmp_path):
     result, out = written
     report.write_results(result, CONFIG, tmp_path, COMMAND, "c0ffee")
-    for name in FILES:
+    for name in REPORT_FILES:
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes(), name
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from exact import exact
 from robot_world import config, standing
 
 from fgloc import se2
@@ -316,10 +315,3 @@ def test_whitening_survives_a_covariance_that_rounding_has_corrupted():
     assert np.isfinite(W).all()
     assert np.linalg.norm(W, 2) <= 1.0 + 1e-6  # no residual counts for more than its own noise lets it
     assert np.linalg.norm(W @ S) < 10.0
-
-
-def test_an_exact_installation_has_no_states():
-    _, landmark_map, _ = scene(0)
-    beacons = LandmarkMap({0: Landmark(0, np.zeros(3), np.eye(3), 0.0)})
-    for corners, held in ((True, landmark_map), (False, beacons), (False, None)):
-        assert len(installation_of(exact(), held, corners, has_gyro=True)) == 0

@@ -11,6 +11,20 @@ from fgloc.types import Decision, Finding, Landmark, LandmarkMap, Mode, TopicTim
 START_NS = 1_700_000_000_000_000_000
 
 
+REPORT_FILES = {
+    "trajectory.tum",
+    "truth.tum",
+    "covariance.csv",
+    "steps.csv",
+    "metrics.json",
+    "config.json",
+    "trajectory.png",
+    "timeline.png",
+    "report.html",
+}
+"""Files of every run with a truth."""
+
+
 def figure_eight(seed=0, n=300, truth=True, modes=None):
     """30 s of figure eights with an honest covariance; the truth is silent in the middle third."""
     rng = np.random.default_rng(seed)
