@@ -83,8 +83,8 @@ def events_of_role(role: Role, fields: RoleFields, content: Any, when: When) -> 
     rows = [(int(i), *row) for i, *row in zip(ids, *others, strict=True)]
     if role == "uwb":
         of_range = make["sensor_msgs/msg/Range"]
-        found = (SimpleNamespace(header=SimpleNamespace(frame_id=str(i)), range=r) for i, r in rows)
-        return [of_range(one, when) for one in found]
+        found = ((i, SimpleNamespace(header=SimpleNamespace(frame_id=str(i)), range=r)) for i, r in rows)
+        return [of_range(one, (*when[:2], f"{when[2]}[{i}]")) for i, one in found]  # each anchor has its own stamps
     if fields.pose is None:
         seen = [SimpleNamespace(id=i, range=r, bearing=b) for i, r, b in rows]
         return [make["landmark_msgs/msg/LandmarkArray"](SimpleNamespace(header=header, landmarks=seen), when)]
