@@ -402,6 +402,12 @@ class TopicsConfig(Section):
     _cameras: dict[Role, str | None] = PrivateAttr(default_factory=dict)
     _asked: frozenset[Role] = PrivateAttr(default=frozenset())
     _of_joints: tuple[str, ...] = PrivateAttr(default=())
+    _of_fields: dict[Role, str] = PrivateAttr(default_factory=dict)
+
+    @property
+    def of_fields(self) -> Mapping[Role, str]:
+        """Topic of any type by the role that `recording.fields` makes of it, where no other topic is given."""
+        return {role: topic for role, topic in self._of_fields.items() if getattr(self, role, None) in (None, topic)}
 
     @property
     def of_joints(self) -> tuple[str, ...]:
@@ -429,6 +435,7 @@ class TopicsConfig(Section):
         given: str | None = getattr(self, role, None)
         if role == "joints" and given is None and self._of_joints:
             return self._of_joints[0]
+        given = given or self._of_fields.get(role)
         if given is None and role in optional_roles() and role not in self._asked:
             return "none"
         return "none" if given is None and self._cameras and role in CAMERA_ROLES else given
@@ -495,12 +502,33 @@ class JointField(Section):
         return self
 
 
+_EntryPath = Annotated[
+    str, StringConstraints(pattern=r"^[A-Za-z_]\w*(\[\d*\])?(\.[A-Za-z_]\w*(\[\d*\])?)*$", max_length=200)
+]
+_MADE = {"odometry": ("forward", "turn"), "sightings": ("id",), "uwb": ("id", "range")}  # what a role needs
+
+
+class RoleFields(Section):
+    """A role played by fields of a message of any type; of each entry of an array by ``[]``: ``nodes[].id``."""
+
+    topic: str = Field(min_length=1, description="of any message type")
+    id: _EntryPath | None = Field(None, description="of the landmark or anchor: tags[].id, ids[]")
+    range: _EntryPath | None = Field(None, description="its distance")
+    bearing: _EntryPath | None = Field(None, description="its direction [rad]")
+    pose: _EntryPath | None = Field(None, description="of a marker, in place of range and bearing: a Pose or Transform")
+    forward: _EntryPath | None = Field(None, description="speed of an odometry [m/s]")
+    turn: _EntryPath | None = Field(None, description="yaw rate of an odometry [rad/s]")
+
+
 class RecordingConfig(Section):
     """How to read a recording."""
 
     topics: TopicsConfig = TopicsConfig()
     joints: dict[str, JointField] = Field(
         {}, max_length=100, description="joints in messages of other types (docs/drives.md)"
+    )
+    fields: dict[Literal["odometry", "sightings", "uwb"], RoleFields] = Field(
+        {}, description="other roles in messages of other types: topic and fields of each (docs/formats.md)"
     )
     odometries: tuple[OdometryTopic, ...] = Field(
         (), max_length=8, description="beside the wheels: name, topic, pose of each (docs/odometries.md)"
@@ -544,9 +572,14 @@ class RecordingConfig(Section):
             raise ValueError(
                 f"topics.joints is {self.topics.joints}, expected no topic beside recording.joints, or none"
             )
-        if topics != self.topics._of_joints:
+        made = {str(role): fields.topic for role, fields in self.fields.items()}
+        for role, fields in self.fields.items():
+            needed = _MADE[role] + (("range", "bearing") if role == "sightings" and fields.pose is None else ())
+            if lacking := [key for key in needed if getattr(fields, key) is None]:
+                raise ValueError(f"fields.{role} lacks {' and '.join(lacking)}, expected the field of each")
+        if topics != self.topics._of_joints or made != self.topics._of_fields:
             read = self.topics.model_copy()
-            read._of_joints = topics
+            read._of_joints, read._of_fields = topics, made
             self.__dict__["topics"] = read
         return self
 

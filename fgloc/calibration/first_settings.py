@@ -12,10 +12,13 @@ from pathlib import Path
 
 import yaml
 
+from fgloc.calibration.first_fields import FirstWheels, find_joints, find_roles, fit_wheels
 from fgloc.config import (
     CAMERA_ROLES,
     Config,
     Role,
+    RoleFields,
+    base_role,
     base_roles,
     camera_role,
     config_of,
@@ -32,7 +35,7 @@ from fgloc.diagnosis.signals import other_clocks, read_signals
 from fgloc.errors import FglocError
 from fgloc.extensions import outside_sensors
 from fgloc.frames import BASE_NAMES
-from fgloc.recording.fields import NumericField, unread_numbers
+from fgloc.recording.fields import NumericField, unread_numbers, unread_paths
 from fgloc.recording.info import LACKING, RecordingInfo, inspect_recording, placing_roles
 from fgloc.recording.reader import POINT, TF_TYPES, Recording, converters_of, is_derived, unrectified
 from fgloc.recording.storage import Storage, find_beside
@@ -111,6 +114,8 @@ class _Seen:
     sections: tuple[FirstSection, ...]
     others: Mapping[Role, tuple[str, ...]]  # topics that could each play a role beyond the built-in ones
     numbers: tuple[NumericField, ...]  # that may be of wheels, where no topic is
+    wheels: FirstWheels  # in some of them
+    made: Mapping[str, RoleFields]  # other roles in messages of other types
 
 
 Ask = Callable[[Asked], Mapping[str, str] | None]
@@ -275,6 +280,18 @@ def _places(lines: Sequence[str]) -> list[str]:
 
 def _look(bag: Path) -> _Seen:
     config = _with_cameras(bag, Config())
+    with Recording(bag, config.recording) as recording:
+        roles = recording.roles
+    known = TF_TYPES.union(*map(converters_of, role_names())) - {POINT}
+    with closing(Storage(bag)) as storage:
+        numbers = () if _WHEELED & roles.keys() else _numbers(storage, known, roles.values())
+        made = find_roles(unread_paths(storage, known, roles.values()), {*map(base_role, roles)})
+    wheels = FirstWheels({} if "odometry" in made else find_joints(numbers), {})
+    config = with_value(config, "recording", _read_by_fields(wheels, made))
+    if wheels.joints:
+        with Recording(bag, config.recording) as recording:
+            wheels = fit_wheels(wheels.joints, read_signals(recording, config), config)
+        config = with_value(_with_cameras(bag, Config()), "recording", _read_by_fields(wheels, made))
     others = _others(bag, config)
     for role, (first, *_) in others.items():
         config = with_value(config, f"recording.topics.{role}", first)
@@ -295,21 +312,33 @@ def _look(bag: Path) -> _Seen:
         except FglocError:  # a run says what is wrong with it
             landmark_map = None
         _look_at_optional(bag, config, roles.values(), watch)
-        look = FirstLook(info.roles, events, recording, has_map, landmark_map)
+        look = FirstLook(info.roles, events, recording, has_map, landmark_map, tuple(_wheels(wheels)))
         frames = tuple(name for name in BASE_NAMES if name in recording.frames)
-        numbers = () if _WHEELED & roles.keys() else _numbers(bag, roles.values())
-        return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted), others, numbers)
+        return _Seen(info, has_map, frames, tuple(of.section(look) for of in wanted), others, numbers, wheels, made)
 
 
 _WHEELED: frozenset[Role] = frozenset({"odometry", "joints"})
 _MOST_NUMBERS = 12  # lines
 
 
-def _numbers(bag: Path, taken: Collection[str]) -> tuple[NumericField, ...]:
+def _read_by_fields(wheels: FirstWheels, made: Mapping[str, RoleFields]) -> dict[str, dict[str, dict[str, object]]]:
+    """Keys of the section `recording` with joints and roles in messages of other types."""
+    joints = {name: joint.model_dump(exclude_unset=True, exclude_none=True) for name, joint in wheels.joints.items()}
+    fields = {role: fields.model_dump(exclude_unset=True) for role, fields in made.items()}
+    return {key: found for key, found in (("joints", joints), ("fields", fields)) if found}
+
+
+def _wheels(wheels: FirstWheels) -> Iterator[str]:
+    """Section of wheels whose geometry was found."""
+    if wheels.wheels:
+        yield f"# Geometry of the joints above by this recording, {wheels.why}; measure it all the same."
+        yield "wheels:"
+        yield from (f"  {key}: {one_line(value)}" for key, value in wheels.wheels.items())
+
+
+def _numbers(storage: Storage, known: Collection[str], taken: Collection[str]) -> tuple[NumericField, ...]:
     """Numbers on topics without a role, those first whose names are of wheels."""
-    known = TF_TYPES.union(*map(converters_of, role_names())) - {POINT}
-    with closing(Storage(bag)) as storage:
-        return tuple(sorted(unread_numbers(storage, known, taken), key=lambda number: not number.is_of_wheels))
+    return tuple(sorted(unread_numbers(storage, known, taken), key=lambda number: not number.is_of_wheels))
 
 
 _MOST_OPTIONAL = 500  # messages of such a topic
@@ -396,13 +425,17 @@ def _recording(seen: _Seen, missing: list[str]) -> Iterator[str]:
         missing.append(f"which topic is the {role}: {first} is taken, {', '.join(rest)} could be it too")
     for problem in seen.info.problems:
         yield f"    # to be settled: {problem}"
-    if seen.numbers:
+    for key, found in _read_by_fields(seen.wheels, seen.made).items():
+        yield f"  {key}:  # in messages of other types, by the names of fields: check them"
+        yield from (f"    {name}: {one_line(fields)}" for name, fields in found.items())
+    numbers = () if seen.wheels.joints or "odometry" in seen.made else seen.numbers
+    if numbers:
         yield "  # Fields that may be wheels' angles (position) or rates (velocity); fill in what is (docs/drives.md):"
         yield "  # joints:"
-    for n in seen.numbers[:_MOST_NUMBERS]:
+    for n in numbers[:_MOST_NUMBERS]:
         kind = "velocity" if n.is_rate else "position"
         yield f"  #   NAME: {{topic: {n.topic}, {kind}: {n.path}, scale: 1.0}}  # {n.low:.4g} to {n.high:.4g}"
-    if more := len(seen.numbers[_MOST_NUMBERS:]):
+    if more := len(numbers[_MOST_NUMBERS:]):
         yield f"  #   and {more} more"
     if seen.frames:
         yield f"  base_frame: {seen.frames[0]}"

@@ -15,23 +15,27 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from fgloc.config import JointField
+from fgloc.config import JointField, Role, RoleFields
 from fgloc.recording.messages import Decoder
-from fgloc.recording.storage import Storage
+from fgloc.recording.storage import Channel, Storage
 from fgloc.sensors import registry
 from fgloc.sensors.base import When
 from fgloc.types import Event, FloatArray
 
 _STEP = re.compile(r"(\w+)|\[(\d+)\]")
-_RATE = re.compile(r"speed|vel(ocity)?(?![a-z])|rpm|rate", re.IGNORECASE)
-_ANGLE = re.compile(r"steer|angle|tick|count|encoder|position", re.IGNORECASE)
-_MOST_FIELDS = 12  # of a message that tells of wheels: more is a status or a scan
+_RATE = re.compile(r"speed|vel(ocity|ocities|s)?(?![a-z])|rpm|rate", re.IGNORECASE)
+_ANGLE = re.compile(r"steer|angle|tick|count|encoder|position|travel", re.IGNORECASE)
+_MOST_FIELDS = 12  # of a message that is of little else: of longer ones those that are named so
+_CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_LARGE = re.compile("(sensor|nav|visualization|rosgraph|rcl_interfaces|diagnostic)_?(msgs)?/")  # no wheels in them
+_MOST_ENTRIES = 4  # of an array
 _MOST_LOOKED_AT = 5000  # messages
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _MOST_WAITING = 2000  # readings of a topic that wait for those of the others
 _AGAIN_NS = 1_000_000_000  # a message received so much before the last one: the recording is read again
 _ENOUGH = 20  # messages without an event, to be told
 _DEEPEST = 8  # messages inside messages
+_TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
 def value_at(content: Any, path: str) -> float:
@@ -40,13 +44,62 @@ def value_at(content: Any, path: str) -> float:
     Raises:
         AttributeError, IndexError, TypeError, ValueError: there is none.
     """
+    return float(_part(content, path))
+
+
+def _part(content: Any, path: str) -> Any:
     for name, index in _STEP.findall(path):
         content = getattr(content, name) if name else content[int(index)]
-    return float(content)
+    return content
 
 
-def numeric_fields(message_type: str, definitions: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
-    """Paths of the numbers in a message type, as `value_at` reads them; of an array that of its first element.
+def entries_at(content: Any, path: str) -> list[Any]:
+    """Values in a message by a path; where it has ``[]``, one of each entry of that array.
+
+    Raises:
+        AttributeError, IndexError, TypeError: there is none.
+    """
+    array, each, rest = path.partition("[]")
+    if not each:
+        return [_part(content, path)]
+    return [value for entry in _part(content, array) for value in entries_at(entry, rest.removeprefix("."))]
+
+
+def events_of_role(role: Role, fields: RoleFields, content: Any, when: When) -> list[Event]:
+    """Events of a message whose fields play a role, by the converter of a usual type with the same content.
+
+    Raises:
+        AttributeError, IndexError, TypeError, ValueError: it lacks a field, or has not as many of one as of another.
+    """
+    make, header = registry.converters(role), getattr(content, "header", SimpleNamespace(frame_id=""))
+    if role == "odometry":
+        forward, turn = (value_at(content, path or "") for path in (fields.forward, fields.turn))
+        linear, angular = SimpleNamespace(x=forward, y=0.0, z=0.0), SimpleNamespace(x=0.0, y=0.0, z=turn)
+        message = SimpleNamespace(header=header, twist=SimpleNamespace(linear=linear, angular=angular))
+        return [make["geometry_msgs/msg/TwistStamped"](message, when)]
+    ids, *others = (
+        entries_at(content, path) for path in (fields.id, fields.range, fields.bearing, fields.pose) if path is not None
+    )
+    rows = [(int(i), *row) for i, *row in zip(ids, *others, strict=True)]
+    if role == "uwb":
+        of_range = make["sensor_msgs/msg/Range"]
+        found = ((i, SimpleNamespace(header=SimpleNamespace(frame_id=str(i)), range=r)) for i, r in rows)
+        return [of_range(one, (*when[:2], f"{when[2]}[{i}]")) for i, one in found]  # each anchor has its own stamps
+    if fields.pose is None:
+        seen = [SimpleNamespace(id=i, range=r, bearing=b) for i, r, b in rows]
+        return [make["landmark_msgs/msg/LandmarkArray"](SimpleNamespace(header=header, landmarks=seen), when)]
+    markers = [SimpleNamespace(marker_id=i, pose=_as_pose(row[-1])) for i, *row in rows]
+    return [make["aruco_opencv_msgs/msg/ArucoDetection"](SimpleNamespace(header=header, markers=markers), when)]
+
+
+def _as_pose(pose: Any) -> Any:
+    """A Pose, where a Transform may be given."""
+    moved = getattr(pose, "translation", None)
+    return pose if moved is None else SimpleNamespace(position=moved, orientation=pose.rotation)
+
+
+def numeric_fields(message_type: str, definitions: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
+    """Paths of the numbers in a message type and their types ("uint16"); ``[]`` in a path stands for each entry.
 
     Args:
         message_type: "pkg/msg/Name".
@@ -56,36 +109,59 @@ def numeric_fields(message_type: str, definitions: Mapping[str, Any], depth: int
     if message_type not in definitions or depth > _DEEPEST:
         return
     for name, (kind, content) in definitions[message_type][1]:
-        if name == "header":
+        if name == "header" or content in _TIMES:
             continue
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            name, (kind, content) = f"{name}[0]", content[0]
+            name, (kind, content) = f"{name}[]", content[0]
         if kind == Nodetype.NAME:
-            yield from (f"{name}.{inner}" for inner in numeric_fields(content, definitions, depth + 1))
+            yield from ((f"{name}.{path}", of) for path, of in numeric_fields(content, definitions, depth + 1))
         elif kind == Nodetype.BASE and content[0] not in ("string", "wstring"):
-            yield name
+            yield name, content[0]
 
 
 @dataclass(frozen=True, slots=True)
 class NumericField:
-    """One number of a topic's messages, with the range of its first values."""
+    """One number of a topic's messages: its type, such as "uint16", and the range of its first values."""
 
     topic: str
     path: str
+    kind: str
     low: float
     high: float
 
     @property
+    def name(self) -> str:
+        """Name of its topic and its path, without camel case."""
+        return _CAMEL.sub("_", f"{self.topic} {self.path}").lower()
+
+    @property
     def is_of_wheels(self) -> bool:
         """Whether its name or its topic's says that it is an angle, a rate or a counter of wheels."""
-        name = f"{self.topic} {self.path}"
-        return bool(_RATE.search(name) or _ANGLE.search(name) or "wheel" in name.lower())
+        return bool(_RATE.search(self.name) or _ANGLE.search(self.name) or "wheel" in self.name)
 
     @property
     def is_rate(self) -> bool:
         """Whether its name or its topic's says that it is one, and not an angle."""
-        name = f"{self.topic} {self.path}"
-        return bool(_RATE.search(name)) and not _ANGLE.search(name)
+        return bool(_RATE.search(self.name)) and not _ANGLE.search(self.name)
+
+
+def _unread(
+    storage: Storage, known: Collection[str], taken: Collection[str]
+) -> Iterator[tuple[Channel, Decoder, dict[str, str]]]:
+    """Channels of types that nothing reads, with a decoder, and the types of their numbers by path."""
+    channels = [
+        c
+        for c in storage.channels
+        if c.count and c.message_type not in known and c.topic not in taken and not _LARGE.match(c.message_type)
+    ]
+    decoder = Decoder(storage.kind == "ros1", [(c.message_type, c.definition) for c in channels])
+    for channel in channels:
+        yield channel, decoder, dict(numeric_fields(channel.message_type, decoder.store.fielddefs))
+
+
+def unread_paths(storage: Storage, known: Collection[str], taken: Collection[str]) -> dict[str, dict[str, str]]:
+    """Types of the numbers by path, by topic, of those that `unread_numbers` looks at."""
+    return {channel.topic: paths for channel, _, paths in _unread(storage, known, taken)}
 
 
 def unread_numbers(storage: Storage, known: Collection[str], taken: Collection[str]) -> Iterator[NumericField]:
@@ -96,22 +172,26 @@ def unread_numbers(storage: Storage, known: Collection[str], taken: Collection[s
         known: types that something reads.
         taken: topics that play a role.
     """
-    channels = [c for c in storage.channels if c.count and c.message_type not in known and c.topic not in taken]
-    decoder = Decoder(storage.kind == "ros1", [(c.message_type, c.definition) for c in channels])
-    for channel in channels:
-        paths = [*numeric_fields(channel.message_type, decoder.store.fielddefs)]
-        if not 0 < len(paths) <= _MOST_FIELDS:
+    for channel, decoder, paths in _unread(storage, known, taken):
+        fields = {
+            path.replace("[]", f"[{k}]", 1).replace("[]", "[0]"): kind
+            for path, kind in paths.items()
+            for k in range(_MOST_ENTRIES if "[]" in path else 1)
+        }
+        if len(fields) > _MOST_FIELDS:
+            fields = {p: k for p, k in fields.items() if NumericField(channel.topic, p, k, 0.0, 0.0).is_of_wheels}
+        if not 0 < len(fields) <= 4 * _MOST_FIELDS:
             continue
-        seen: dict[str, list[float]] = {path: [] for path in paths}
+        seen: dict[str, list[float]] = {path: [] for path in fields}
         for _, message_type, _, raw in islice(storage.messages([channel.topic]), _MOST_LOOKED_AT):
             with suppress(Exception):  # rosbags leaks struct, decoding, key and assertion errors on damaged bytes
                 content = decoder.deserialize(message_type, raw)
-                for path in paths:
+                for path in fields:
                     with suppress(IndexError):  # an array may be empty
                         seen[path].append(value_at(content, path))
         for path, values in seen.items():
             if values:
-                yield NumericField(channel.topic, path, min(values), max(values))
+                yield NumericField(channel.topic, path, fields[path], min(values), max(values))
 
 
 class JointFields:

@@ -28,7 +28,7 @@ from fgloc.config import (
     role_names,
 )
 from fgloc.errors import RecordingError
-from fgloc.recording.fields import JointFields, numeric_fields
+from fgloc.recording.fields import JointFields, events_of_role, numeric_fields
 from fgloc.recording.messages import Decoder
 from fgloc.recording.storage import RawMessage, Storage, lost
 from fgloc.recording.transforms import TF_TOPIC, FrameTree, is_odometry_pair, pair_topic
@@ -83,11 +83,14 @@ class MessageEvents:
             return list(transforms(content, received_ns, topic, topic.rstrip("/").endswith("tf_static")))
         if role is None:
             return []
-        header = None if role in self._config.received_stamps else getattr(content, "header", None)
-        stamp_ns = received_ns if header is None else nanoseconds(header.stamp)
+        header = None if role in self._config.received_stamps else getattr(content, "header", content)
+        stamp = getattr(header, "stamp", None)
+        stamp_ns = received_ns if stamp is None else nanoseconds(stamp)
         stamp_ns += round(self._config.stamp_offset_s.get(role, 0.0) * 1e9)
         if topic in self._fields.topics:
             return self._fields.events(content, (stamp_ns, received_ns, topic))
+        if self._config.topics.of_fields.get(role) == topic:
+            return events_of_role(role, self._config.fields[role], content, (stamp_ns, received_ns, topic))  # type: ignore[index]
         return [converters_of(role)[message_type](content, (stamp_ns, received_ns, topic))]
 
 
@@ -266,7 +269,7 @@ def _given_roles(
             continue
         if role in config.of_cameras and given not in filled and seeing:
             notes.append(f"{topic_key(role)}: {given} has no messages; the run goes on without it.")
-        elif role == "joints" and given in config.of_joints:
+        elif given in (config.of_joints if role == "joints" else (config.of_fields.get(role),)) and given in filled:
             roles[role] = given
         elif given in config.of_joints:
             problems.append(f"{topic_key(role)}: {given} is given in recording.joints too; choose one of them")
@@ -484,7 +487,8 @@ class Recording:
             known = found.setdefault(channel.topic, TopicInfo(channel.topic, channel.message_type, 0))
             found[channel.topic] = replace(known, count=known.count + channel.count)
         known_types = TF_TYPES.union(*map(converters_of, role_names()))
-        known_types |= {t.message_type for t in found.values() if t.name in config.topics.of_joints}
+        by_fields = {*config.topics.of_joints, *config.topics.of_fields.values()}
+        known_types |= {t.message_type for t in found.values() if t.name in by_fields}
         self._decoder = Decoder(
             self.kind == "ros1",
             [(c.message_type, c.definition) for c in channels if c.message_type in known_types and c.count],
@@ -622,14 +626,14 @@ class Recording:
         for name, joint in self.config.joints.items():
             if not counts.get(joint.topic) or joint.topic not in self.config.topics.of_joints:
                 continue
-            there = [*numeric_fields(types[joint.topic], self._decoder.store.fielddefs)]
-            plain = {re.sub(r"\[\d+\]", "[0]", field) for field in there}
+            there = [path for path, _ in numeric_fields(types[joint.topic], self._decoder.store.fielddefs)]
+            shown = ", ".join(there).replace("[]", "[0]") or "none: the recording does not hold its definition"
             for key in ("position", "velocity"):
                 field = getattr(joint, key)
-                if field is not None and re.sub(r"\[\d+\]", "[0]", field) not in plain:
+                if field is not None and re.sub(r"\[\d+\]", "[]", field) not in there:
                     yield (
                         f"recording.joints.{name}.{key}: {joint.topic} ({types[joint.topic]}) has no number {field}, "
-                        f"expected one of {', '.join(there) or 'none: the recording does not hold its definition'}"
+                        f"expected one of {shown}"
                     )
 
     def decode(self, message: RawMessage, role: Role | None) -> list[Event]:

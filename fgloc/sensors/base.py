@@ -138,6 +138,7 @@ class FirstLook:
         recording: opened.
         has_map: a map lies beside it.
         landmark_map: that map; None where it cannot be read.
+        wheels: lines of the section of the wheels, where the geometry of joints by their fields was found.
     """
 
     roles: Mapping[str, str]
@@ -145,6 +146,7 @@ class FirstLook:
     recording: Any
     has_map: bool
     landmark_map: LandmarkMap | None = None
+    wheels: tuple[str, ...] = ()
 
     def of(self, kind: type[E]) -> list[E]:
         """Events of a class that the sensor asked for."""

@@ -138,7 +138,7 @@ def check(event: UwbEvent, gate: GateConfig) -> UwbEvent | str:
     range_m = event.range_m * unit_m
     if not math.isfinite(range_m):
         return "non_finite"
-    if not gate.min_range <= range_m <= gate.max_range:
+    if not (range_m > 0.0 and gate.min_range <= range_m <= gate.max_range):
         return "range_bound"
     return event if unit_m == 1.0 else replace(event, range_m=range_m)
 

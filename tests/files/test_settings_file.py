@@ -107,7 +107,7 @@ def nested(place, value):
 
 def test_every_value_is_refused_where_it_is_not_with_what_replaces_it(write):
     counts = Counter(level for _, level, _ in values())
-    assert counts["user"] <= 45
+    assert counts["user"] <= 46
     assert counts["expert"] < 80
     for place, level, default in values():
         name = ".".join(place)

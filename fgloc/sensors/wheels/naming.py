@@ -115,7 +115,7 @@ def _named(
         lists = _list("wheels", wheels), _list("steering_joints", steering)
         why = f"each of {len(wheels)} wheels has a steering joint"
         return NamedDrive("swerve", why, (*lists, "radius:  # m", "places:  # m: [[x, y], ...], in the same order"))
-    if len(steering) == len(wheels) == 1 and not _BEHIND.search(_words(wheels[0])):
+    if len(steering) == len(wheels) == 1 and not _BEHIND.search(_words(wheels[0])) and wheels != ["speed"]:
         why = (
             f"{steering[0]} steers and {wheels[0]} drives; if that wheel is not the one that steers, the kind is "
             "ackermann, with wheels and steering_joints as lists"
@@ -125,7 +125,8 @@ def _named(
     if steering and wheels:
         rear = [name for name in wheels if not _FRONT.search(_words(name))] or wheels
         by_side = sorted(steering, key=lambda name: bool(_RIGHT.search(_words(name))))
-        keys = (_list("wheels", rear), _list("steering_joints", by_side), "radius:  # m", "wheelbase:  # m")
+        measured = (_list("wheels", rear), _list("steering_joints", by_side), "radius:  # m")
+        keys = (*(measured if wheels != ["speed"] else ()), "wheelbase:  # m")  # a speed is the default
         return NamedDrive("ackermann", f"steered by {' and '.join(steering)}", keys)
     placed = [
         [name for name in wheels if end.search(_words(name)) and side.search(_words(name))]

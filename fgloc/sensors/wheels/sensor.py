@@ -275,6 +275,8 @@ def _first_section(look: FirstLook) -> FirstSection:
     """Joints, radii and track, as far as the recording shows them."""
     joints, odometry, commands = look.of(JointsEvent), look.of(OdometryEvent), look.of(ControlEvent)
     names = joint_names(joints)
+    if look.wheels:
+        return FirstSection(look.wheels)
     if not names and not odometry and any(command.steering is not None for command in commands):
         why = "commands give a steering angle, and nothing else measures motion"
         missing = (

@@ -1,0 +1,236 @@
+"""Wheels, odometries, ranges and sightings in messages of types that fgloc does not know: what `fgloc init` writes."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from recording_bags import OWN, START_NS
+from rosbags.typesys import get_types_from_msg
+
+from fgloc import run
+from fgloc.calibration.first_fields import find_joints, find_roles
+from fgloc.calibration.first_settings import first_settings
+from fgloc.config import GateConfig, RecordingConfig, RoleFields, config_of_file
+from fgloc.intake.validation import EventValidator
+from fgloc.recording.fields import NumericField, entries_at, events_of_role
+from fgloc.sensors.uwb import check
+from fgloc_datasets.bag import BagWriter
+
+WHEN = (START_NS, START_NS, "/topic")
+
+
+def numbers(*rows):
+    return [NumericField(*row) for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        (  # Kobuki: counters of 16 bits among pulse widths and bumpers
+            [
+                ("/core", "left_encoder", "uint16", 0, 65535),
+                ("/core", "right_encoder", "uint16", 0, 65535),
+                ("/core", "left_pwm", "int8", -20, 30),
+                ("/core", "right_pwm", "int8", -20, 30),
+            ],
+            {"left": ("left_encoder", None, 1.0, 65536.0), "right": ("right_encoder", None, 1.0, 65536.0)},
+        ),
+        (  # Duckietown: one topic a wheel, with the counts of a turn beside
+            [
+                ("/duckie/left_wheel_encoder_node/tick", "data", "int32", 0, 900),
+                ("/duckie/left_wheel_encoder_node/tick", "resolution", "int32", 135, 135),
+                ("/duckie/right_wheel_encoder_node/tick", "data", "int32", 0, 950),
+                ("/duckie/right_wheel_encoder_node/tick", "resolution", "int32", 135, 135),
+            ],
+            dict.fromkeys(("left", "right"), ("data", None, math.tau / 135, 2.0**32)),
+        ),
+        (  # angles before rates
+            [
+                ("/wheel_vels", "velocity_left", "float32", 0, 9),
+                ("/wheel_vels", "velocity_right", "float32", 0, 9),
+                ("/wheel_ticks", "ticks_left", "int32", 0, 900),
+                ("/wheel_ticks", "ticks_right", "int32", 0, 900),
+            ],
+            {s: (f"ticks_{s}", None, 1.0, 2.0**32) for s in ("left", "right")},
+        ),
+        (
+            [("/m", "leftRpm", "float32", 0, 90), ("/m", "rightRpm", "float32", 0, 95)],
+            {"left": (None, "leftRpm", math.tau / 60, None), "right": (None, "rightRpm", math.tau / 60, None)},
+        ),
+        (
+            [("/lwheel", "data", "int16", -9, 900), ("/rwheel", "data", "int16", -9, 900)],
+            dict.fromkeys(("left", "right"), ("data", None, 1.0, 65536.0)),
+        ),
+        (  # two drivers without names
+            [("/f", f"drivers[{k}].{n}", "float32", 0, 9) for k in (0, 1) for n in ("current", "measured_travel")],
+            {s: (f"drivers[{k}].measured_travel", None, 1.0, None) for k, s in enumerate(("left", "right"))},
+        ),
+        (
+            [("/car", "speed", "float64", 0, 4), ("/car", "steering_angle", "float64", -25, 25)],
+            {"speed": (None, "speed", 1.0, None), "steering_angle": ("steering_angle", None, math.pi / 180, None)},
+        ),
+        ([("/bumper", "left_wheel_drop", "uint8", 0, 1), ("/bumper", "right_wheel_drop", "uint8", 0, 1)], {}),
+        ([("/w", "left_ticks", "int32", 5, 5), ("/w", "right_ticks", "int32", 5, 5)], {}),  # never moved
+        ([("/w", "left_arm", "float32", 0, 1), ("/w", "right_arm", "float32", 0, 1)], {}),
+        ([("/battery", "voltage", "float32", 11, 12)], {}),
+    ],
+)
+def test_names_of_fields_tell_the_wheels(rows, expected):
+    found = find_joints(numbers(*rows))
+    assert found.keys() == expected.keys()
+    for name, (position, velocity, scale, rolls_over) in expected.items():
+        joint = found[name]
+        assert (joint.position, joint.velocity, joint.rolls_over) == (position, velocity, rolls_over)
+        assert joint.scale == pytest.approx(scale, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("topic", "kinds", "role", "expected"),
+    [
+        ("/scout_status", {"linear_velocity": "float64", "angular_velocity": "float64", "soc": "float64"}, "odometry",
+         {"forward": "linear_velocity", "turn": "angular_velocity"}),
+        ("/nlink", {"id": "uint8", "local_time": "uint32", "nodes[].role": "uint8", "nodes[].id": "uint8",
+                    "nodes[].dis": "float32", "uwb": "uint8"}, "uwb", {"id": "nodes[].id", "range": "nodes[].dis"}),
+        ("/gtec/toa/ranging", {"anchorId": "int32", "tagId": "int32", "range": "int32", "seq": "int32"}, "uwb",
+         {"id": "anchorId", "range": "range"}),
+        ("/uwb", {"anchor_ids[]": "uint16", "distances[]": "float32"}, "uwb",
+         {"id": "anchor_ids[]", "range": "distances[]"}),
+        ("/landmark", {"max_sensor_distance": "float64", "sensed_data[].range": "float64",
+                       "sensed_data[].yaw": "float64", "sensed_data[].id": "int32"}, "sightings",
+         {"id": "sensed_data[].id", "range": "sensed_data[].range", "bearing": "sensed_data[].yaw"}),
+        ("/stag", {"tags[].id": "uint32", "tags[].pose.position.x": "float64", "tags[].pose.orientation.w": "float64"},
+         "sightings", {"id": "tags[].id", "pose": "tags[].pose"}),
+    ],
+)  # fmt: skip
+def test_names_of_fields_tell_other_roles(topic, kinds, role, expected):
+    assert find_roles({topic: kinds}, set()) == {role: RoleFields(topic=topic, **expected)}
+    busy = {"odometry"} if role == "odometry" else {"sightings", "uwb"}
+    assert find_roles({topic: kinds}, busy) == {}
+
+
+@pytest.mark.parametrize(
+    ("topic", "kinds"),
+    [
+        ("/sonar", {"sonar_id": "uint8", "distance": "float32"}),  # no radio
+        ("/people", {"people[].id": "int32", "people[].pose.position.x": "float64"}),  # they walk
+        ("/cmd", {"linear_velocity": "float64", "angular_velocity": "float64"}),
+        ("/base_cmd", {"linear_x": "float32", "angular_z": "float32"}),
+    ],
+)
+def test_what_only_looks_like_it_is_left_alone(topic, kinds):
+    if topic == "/cmd":
+        topic = "/target_speed"
+    assert find_roles({topic: kinds}, set()) == {}
+
+
+def test_a_message_of_ranges_makes_an_event_of_each():
+    nodes = [SimpleNamespace(id=i, dis=r) for i, r in ((3, 2.5), (7, 4.0))]
+    message = SimpleNamespace(nodes=nodes)
+    fields = RoleFields(topic="/nlink", id="nodes[].id", range="nodes[].dis")
+    events = events_of_role("uwb", fields, message, WHEN)
+    assert [(e.anchor, e.range_m) for e in events] == [(3, 2.5), (7, 4.0)]
+    gate = EventValidator(GateConfig())
+    assert [gate.check(event) for event in events] == events  # of one stamp, and none a duplicate
+    arrays = SimpleNamespace(ids=np.array([3, 7], np.uint16), ranges=np.array([2.5], np.float32))
+    with pytest.raises(ValueError, match="shorter"):
+        events_of_role("uwb", RoleFields(topic="/a", id="ids[]", range="ranges[]"), arrays, WHEN)
+    assert entries_at(arrays, "ids[]") == [3, 7]
+    assert entries_at(message, "nodes[1].dis") == [4.0]
+
+
+def test_a_range_of_zero_is_none():
+    silent = events_of_role("uwb", RoleFields(topic="/a", id="i", range="r"), SimpleNamespace(i=1, r=0.0), WHEN)
+    assert check(silent[0], GateConfig()) == "range_bound"
+
+
+def test_bearings_and_transforms_make_sightings():
+    header = SimpleNamespace(frame_id="camera")
+    seen = SimpleNamespace(header=header, z=[SimpleNamespace(id=4, range=2.0, yaw=0.5)])
+    fields = RoleFields(topic="/a", id="z[].id", range="z[].range", bearing="z[].yaw")
+    (event,) = events_of_role("sightings", fields, seen, WHEN)
+    assert (event.frame_id, event.sightings[0].landmark_id, event.sightings[0].bearing_rad) == ("camera", 4, 0.5)
+    moved, turned = SimpleNamespace(x=1.0, y=2.0, z=3.0), SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    tag = SimpleNamespace(tag_id=9, transform=SimpleNamespace(translation=moved, rotation=turned))
+    fields = RoleFields(topic="/a", id="tags[].tag_id", pose="tags[].transform")
+    (event,) = events_of_role("sightings", fields, SimpleNamespace(header=header, tags=[tag]), WHEN)
+    assert event.sightings[0].landmark_id == 9
+    assert event.sightings[0].position.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("role", "fields"),
+    [
+        ("uwb", {"id": "i"}),
+        ("odometry", {"forward": "v"}),
+        ("sightings", {"id": "i", "range": "r"}),
+        ("sightings", {"pose": "p"}),
+    ],
+)
+def test_a_role_that_lacks_a_field_is_refused(role, fields):
+    with pytest.raises(ValueError, match="lacks"):
+        RecordingConfig.model_validate({"fields": {role: {"topic": "/a", **fields}}})
+
+
+# --- A recording of a robot that nobody described ---------------------------------------------------------------------
+
+_TICKS, _TRACK, _SECONDS = 11724.0, 0.23, 60.0  # a metre, m, s
+
+
+def _motion(step_s=0.02):
+    """Times, speed, yaw rate and poses of a robot that winds about."""
+    t = np.arange(0.0, _SECONDS, step_s)
+    v, w = 0.3 * np.minimum(t / 2.0, 1.0), 0.5 * np.sin(0.3 * t) + 0.2
+    yaw = np.cumsum(w) * step_s
+    return t, v, w, np.cumsum(v * np.cos(yaw)) * step_s, np.cumsum(v * np.sin(yaw)) * step_s, yaw
+
+
+def _stranger(path, backwards=False, landmarks=True):
+    """A bag with counters of 16 bits in a message of an own type, a gyro, and ranges with bearings to ten landmarks."""
+    t, v, w, x, y, yaw = _motion()
+    left, right = (np.cumsum(v + s * 0.5 * _TRACK * w) * 0.02 * _TICKS for s in (-1, 1))
+    right = -right if backwards else right
+    rng = np.random.default_rng(1)
+    with BagWriter(path) as bag:
+        own = "uint16 left_encoder\nuint16 right_encoder\nint8 left_pwm\nint8 right_pwm\n"
+        bag._store.register(get_types_from_msg(own, OWN))
+        for k, (at, speed, turn) in enumerate(zip(t, v, w, strict=True)):
+            at_ns = START_NS + round(at * 1e9)
+            values = int(left[k] + 60000) % 65536, int(right[k] + 7) % 65536, int(40 * speed), int(41 * speed)
+            names = ("left_encoder", "right_encoder", "left_pwm", "right_pwm")
+            bag.write("/core", OWN, bag.make(OWN, **dict(zip(names, values, strict=True))), at_ns)
+            bag.imu("/imu", at_ns, (0.0, 0.0, turn + rng.normal(0, 0.003)), (0.0, 0.0, 9.81))
+            seen = []
+            for i in range(10 if k % 5 == 0 and landmarks else 0):
+                ahead, left_of = 3.0 * math.cos(i) - 1.0 - x[k], 3.0 * math.sin(i) - y[k]
+                bearing = math.remainder(math.atan2(left_of, ahead) - yaw[k], math.tau)
+                if abs(bearing) < 1.2:
+                    seen.append((i, math.hypot(ahead, left_of) + rng.normal(0, 0.02), bearing + rng.normal(0, 0.01)))
+            if seen:
+                bag.range_bearing("/seen", at_ns, seen)
+    return path
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_counters_of_an_unknown_robot_are_used_without_a_line_by_hand(tmp_path, backwards):
+    bag = _stranger(tmp_path / "bag", backwards)
+    made = first_settings(bag)
+    config = config_of_file(yaml.safe_load(made.text))
+    left, right = config.recording.joints["left"], config.recording.joints["right"]
+    assert left.rolls_over == right.rolls_over == 65536
+    assert left.scale == pytest.approx(1.0 / _TICKS, rel=0.02)
+    assert right.scale == pytest.approx((-1.0 if backwards else 1.0) / _TICKS, rel=0.02)
+    assert config.wheels.track == pytest.approx(_TRACK, rel=0.03)
+    trajectory = run(bag, None, config, mode="batch").trajectory
+    _, _, _, x, y, _ = _motion()
+    way = math.hypot(*(trajectory.poses[-1] - trajectory.poses[0])[:2])
+    assert way == pytest.approx(math.hypot(x[-1] - x[0], y[-1] - y[0]), abs=0.05)
+
+
+def test_without_anything_that_shows_the_way_the_geometry_is_asked_for(tmp_path):
+    made = first_settings(_stranger(tmp_path / "bag", landmarks=False))
+    config = config_of_file(yaml.safe_load(made.text))
+    assert {*config.recording.joints} == {"left", "right"}
+    assert config.wheels.left_radius is None
+    assert any("radii" in sentence or "geometry" in sentence for sentence in made.missing)
