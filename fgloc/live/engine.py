@@ -110,7 +110,8 @@ class DetectionWorker:
     Attributes:
         detector: what finds them; may be exchanged.
         rejections: images that could not be decoded, by role and reason.
-        dropped: images dropped under overload.
+        dropped: images dropped, as too many waited.
+        early: of them those dropped before the detector was there.
         error: what ended the thread, if it was not `stop`.
     """
 
@@ -126,7 +127,7 @@ class DetectionWorker:
         use_one_thread()
         self.detector: Detector | None = None
         self.rejections: Counter[str] = Counter()
-        self.dropped = 0
+        self.dropped = self.early = 0
         self.error: Exception | None = None
         self._changed = changed
         self._most = most_waiting
@@ -152,6 +153,7 @@ class DetectionWorker:
         waiting = [q for q in self._images if q.state is not State.DETECTING]
         if len(waiting) > self._most:
             self.dropped += 1
+            self.early += self.detector is None
             self.discard(waiting[0])
 
     def discard(self, image: Queued) -> None:
@@ -223,9 +225,11 @@ _COMPARED_FREELY_S = 1.0  # ... beyond so much: what is wrong from the start is 
 _UNFOUND = (State.WAITING, State.DETECTING)
 
 
-def overload_notes(images: int, events: int) -> tuple[str, ...]:
-    """Sentences on so many images and other events that came faster than they could be used."""
+def overload_notes(images: int, events: int, early: int = 0) -> tuple[str, ...]:
+    """Sentences on so many images and other events that came faster than they could be used, or before the run."""
     found = []
+    if early:
+        found.append(f"{early} image(s) dropped before the run, or its camera's calibration and mounting, were there")
     if images:
         found.append(
             f"{images} image(s) dropped: they come faster than markers can be found in them; poses are not those of "
@@ -337,7 +341,7 @@ class Estimation:
             reordering_s = run.reordering_s
         with self._changed:
             rejections += worker.rejections
-            overload = overload_notes(worker.dropped, self._overflow)
+            overload = overload_notes(worker.dropped - worker.early, self._overflow, worker.early)
             return LiveStatus(
                 running=running,
                 mode=None if newest is None else newest.mode,

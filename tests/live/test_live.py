@@ -28,7 +28,7 @@ from fgloc.config import Config, TopicsConfig, load_config, yaml_of
 from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
 from fgloc.live import Live
 from fgloc.live import process as estimation_process
-from fgloc.live.engine import DetectionWorker, Keep, LiveStatus, Queued, Settings, State
+from fgloc.live.engine import DetectionWorker, Keep, LiveStatus, Queued, Settings, State, overload_notes
 from fgloc.live.live import begun_at
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
@@ -354,7 +354,9 @@ def test_of_images_that_wait_the_oldest_gives_way_to_a_new_one():
     worker.stop()
     assert [image.event is None for image in images] == [image.state is State.GONE for image in images]
     assert [image.state for image in images] == [State.GONE] * 2 + [State.WAITING] * 3
-    assert (worker.queued, worker.dropped) == (3, 2)
+    assert (worker.queued, worker.dropped, worker.early) == (3, 2, 2)
+    [told] = overload_notes(worker.dropped - worker.early, 0, worker.early)
+    assert "faster" not in told  # no detector was there yet
 
 
 @pytest.mark.parametrize("fails", [False, True])

@@ -303,7 +303,6 @@ class Node:
                 missing = self.intake.find()
                 if not missing and self.live is None and not self._process.ready:
                     missing = "Waiting for the process that estimates to start."
-                teller.waiting(missing)
                 if self.live is None and self.intake.roles and self._process.ready:
                     self._start()
                     publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
@@ -312,8 +311,9 @@ class Node:
                     teller.tell(f"Subscribed: {topic} ({role}).")
                 status = None if self.live is None else self.live.status()
                 if status is not None:
-                    teller.waiting(f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
+                    missing = missing or (f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
                     teller.tell(*status.notes)
+                teller.waiting(missing)
                 teller.tell(
                     *self._take_notes(), *(_LOST.format(topic, n) for topic, n in self._transport.lost().items())
                 )
