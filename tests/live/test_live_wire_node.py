@@ -283,6 +283,19 @@ def test_ambiguous_topics_are_an_error_and_missing_ones_are_waited_for():
     assert "/left/odometry (nav_msgs/msg/Odometry)" in waiting
 
 
+def test_another_fgloc_in_the_domain_is_named():
+    """Its poses and transforms were mixed with this one's, and nothing said so."""
+    told, stop = [], threading.Event()
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        rival, node_ = Outputs(one, "map", "fgloc"), Node(other, Config(), None)
+        threading.Timer(1.5, stop.set).start()
+        node_.run(stop, told.append)
+        node_.close()
+    assert rival
+    [said] = [sentence for sentence in told if "Another fgloc publishes /fgloc/" in sentence]
+    assert "domain" in said
+
+
 def test_a_run_that_has_begun_says_what_it_still_waits_for(monkeypatch):
     monkeypatch.setattr(node, "_PATIENCE_S", 0.3)
     lacking = "image (/camera): no transform from base_link to 'lens' yet"
