@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from fgloc import se2
 from fgloc.config import Config, camera_role
+from fgloc.diagnosis.marker_sizes import marker_sizes
 from fgloc.diagnosis.signals import SightingCollector
 from fgloc.graph.textbook import Seen, textbook_poses
 from fgloc.sensors.gyro import Gyro
@@ -88,6 +89,10 @@ _LEAST_SCALE = 0.01  # of what wheels are off by, however well they are said to 
 _IN_ITS_PLACE = ", which is given in its place"
 _PLAIN = 0.7  # median whitened residual of sightings that fit
 
+_Sighting = tuple[
+    int, int, FloatArray, FloatArray, float
+]  # stamp, landmark, its place, the sensor's in the base, sigma
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
@@ -104,6 +109,7 @@ class Track:
     seen_ns: IntArray
     ids: IntArray
     places: FloatArray  # (m, 2) in the base frame
+    sensors: FloatArray  # (m, 2) in the base frame, of what saw them
     sigmas: FloatArray  # (m,) [m]
     landmarks: Mapping[int, FloatArray] | None
     scale_sigma: float  # of the wheels, as configured
@@ -111,8 +117,8 @@ class Track:
 
     def seen(self, chosen: NDArray[np.bool_] | IntArray) -> Track:
         """The track with some of its sightings, by mask or index."""
-        own = (self.seen_ns[chosen], self.ids[chosen], self.places[chosen], self.sigmas[chosen])
-        return replace(self, seen_ns=own[0], ids=own[1], places=own[2], sigmas=own[3])
+        names = ("seen_ns", "ids", "places", "sensors", "sigmas")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def surveyed(self) -> tuple[Track, FloatArray]:
         """The track with the sightings of known landmarks alone, and where these are ``(k, 2)``; there is a map."""
@@ -189,6 +195,8 @@ class Sanity:
         self._landmarks = None
         if landmark_map is not None:
             self._landmarks = {i: lm.position[:2].copy() for i, lm in landmark_map.landmarks.items()}
+        known = {} if landmark_map is None else landmark_map.landmarks
+        self._sizes = {i: marker.size_m for i, marker in known.items() if marker.size_m > 0.0}
         self._stamps, self._joined = array("q"), array("b")
         self._motions, self._covs, self._turns = array("d"), array("d"), array("d")
         self._seen_ns, self._ids, self._seen = array("q"), array("q"), array("d")
@@ -225,18 +233,18 @@ class Sanity:
             self._motions.extend(measured.motion.tolist())
             self._covs.extend(measured.cov.ravel().tolist())
             self._turns.append(math.nan if turn is None else turn.yaw)
-            for stamp_ns, landmark_id, place, sigma in seen:
+            for stamp_ns, landmark_id, place, sensor, sigma in seen:
                 self._seen_ns.append(stamp_ns)
                 self._ids.append(landmark_id)
-                self._seen.extend((place[0], place[1], sigma))
+                self._seen.extend((*place, *sensor, sigma))
         return self.watch.checked(step, measured, joined, estimate, list(self._surveyed(step, seen)))
 
     def begin_anew(self) -> None:
         """Restart the comparison at the next pose: it was given, and the odometry does not lead there."""
         self._segment = -1
 
-    def _sightings(self, step: Step) -> Iterator[tuple[int, int, FloatArray, float]]:
-        """Stamp, landmark, place in the base frame and sigma [m] of the sightings that are compared."""
+    def _sightings(self, step: Step) -> Iterator[_Sighting]:
+        """Sightings that are compared."""
         for event in step.sightings:
             if abs(event.stamp_ns - self._last_seen_ns) < _SPARSE_NS:
                 continue
@@ -250,13 +258,13 @@ class Sanity:
             for sighting in self._collector.sightings(event):
                 place = (T[:3, :3] @ sighting.point + T[:3, 3])[:2]
                 sigma = math.hypot(sighting.sigma_m, sighting.sigma_rad * math.hypot(place[0], place[1]))
-                yield event.stamp_ns, sighting.landmark_id, place, sigma
+                yield event.stamp_ns, sighting.landmark_id, place, T[:2, 3], sigma
 
-    def _surveyed(self, step: Step, seen: Sequence[tuple[int, int, FloatArray, float]]) -> Iterator[Placed]:
+    def _surveyed(self, step: Step, seen: Sequence[_Sighting]) -> Iterator[Placed]:
         """Sightings of landmarks of a known map, in the base frame at the step's stamp."""
         if self._landmarks is None:
             return
-        for stamp_ns, landmark_id, place, sigma in seen:
+        for stamp_ns, landmark_id, place, _, sigma in seen:
             if landmark_id in self._landmarks:
                 if stamp_ns != step.stamp_ns:
                     motion = self._wheels.motion_between(step, step.stamp_ns, stamp_ns)[0]
@@ -274,11 +282,20 @@ class Sanity:
         track = self._track(estimates[0].stamp_ns, estimates[-1].stamp_ns)
         if track is None:
             return Verdict(self.watch.findings())
-        verdict = judged(track, estimates)
+        verdict, sizes = judged(track, estimates), self._other_sizes(track, estimates)
         if not (causal or held):
-            return verdict
+            return replace(verdict, findings=(*verdict.findings, *sizes))
         told = [replace(f, text=f.text.replace(_IN_ITS_PLACE, "")) for f in verdict.findings]
-        return replace(verdict, simpler=None, findings=self.watch.findings() or tuple(told))
+        return replace(verdict, simpler=None, findings=(*(self.watch.findings() or told), *sizes))
+
+    def _other_sizes(self, track: Track, estimates: Sequence[Estimate]) -> tuple[Finding, ...]:
+        if track.landmarks is None or not self._sizes:
+            return ()
+        stamps, poses = np.array([e.stamp_ns for e in estimates]), np.array([e.pose for e in estimates])
+        seen, where = track.surveyed()
+        at = se2.interpolate(stamps, poses, seen.seen_ns)
+        expected = se2.turned(where - at[:, :2], -at[:, 2])
+        return marker_sizes(seen.ids, seen.places - seen.sensors, expected - seen.sensors, self._sizes)
 
     def _track(self, first_ns: int, last_ns: int) -> Track | None:
         """Odometry and sightings between two times, the last pass of a clock that jumped; None: no motion known."""
@@ -299,7 +316,7 @@ class Sanity:
         seen_ns = np.array(self._seen_ns, dtype=np.int64)
         inside = np.flatnonzero((seen_ns >= stamps[kept][0]) & (seen_ns <= stamps[kept][-1]))
         inside = inside[:: max(1, -(-len(inside) // _MOST_SIGHTINGS))]
-        seen = np.array(self._seen).reshape(-1, 3)[inside]
+        seen = np.array(self._seen).reshape(-1, 5)[inside]
         return Track(
             stamps[kept],
             joined[kept],
@@ -308,7 +325,8 @@ class Sanity:
             seen_ns[inside],
             np.array(self._ids, dtype=np.int64)[inside],
             seen[:, :2],
-            seen[:, 2],
+            seen[:, 2:4],
+            seen[:, 4],
             self._landmarks,
             self._config.wheels.scale_sigma,
             self._config.wheels.turn_scale_sigma,

@@ -105,6 +105,7 @@ class Localizer:
             return self._jump(step, seen.elsewhere, [*motion.revisions, *seen.decisions])
         # 4. Fuse: if the graph cannot be solved with them, the estimator leaves the sightings out
         with self.stopwatch("fuse"):
+            seen = self.sightings.give_states(motion, seen)
             rebuilt = self.estimator.rebuilt
             belief = self.estimator.update(
                 step.stamp_ns, step.dt, motion.factors, seen.accepted, seen.logged, seen.predicted
@@ -125,9 +126,7 @@ class Localizer:
             self.motion.restart()
         # 6. Record
         rows = [*motion.revisions, *seen.places, *motion.decisions(frame.k), *seen.decisions, *moved]
-        estimate = self._recorder.record(step, frame, rows, seen)
-        self.sightings.modes.states_changed(*self.estimator.give_states())
-        return estimate
+        return self._recorder.record(step, frame, rows, seen)
 
     def restart_at(self, pose: PoseWithCovariance) -> None:
         """At the next step, go on from a pose that is known from elsewhere: an earlier run, or the user.

@@ -912,8 +912,6 @@ class MotionJudge:
 
     def commit(self, motion: JudgedMotion, fix: PoseWithCovariance | None, observes_yaw: bool) -> None:
         """Update bias and drift of the sources after a step, see `MotionSources.commit`."""
-        if motion.budget.overruled_cov is not None and self.sources.gyro is not None:
-            self.sources.gyro.forget_fix()  # no motion led to this one
         if fix is not None:
             self.record_fix()
             for drift in self._drifts or ():

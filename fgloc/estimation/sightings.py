@@ -559,10 +559,21 @@ class SightingJudge:
         if self._tracking.keeps_initial_pose:
             self.modes.forget()  # they all seem moved from there
         logged = () if self._tracking.keeps_initial_pose else [s for s in rejected if not s.measurement.unnamed]
-        lines = None
+        return JudgedSightings(accepted, rejected, logged, decisions, predicted, self._lines(accepted, predicted))
+
+    def _lines(self, accepted: Sequence[LoggedSighting], predicted: PoseWithCovariance) -> Lines | None:
         if accepted and self._estimator.factors.known and is_linear(predicted):
-            lines = self._estimator.factors.linearize([s.measurement for s in accepted], predicted.pose)
-        return JudgedSightings(accepted, rejected, logged, decisions, predicted, lines)
+            return self._estimator.factors.linearize([s.measurement for s in accepted], predicted.pose)
+        return None
+
+    def give_states(self, motion: JudgedMotion, seen: JudgedSightings) -> JudgedSightings:
+        """Make states of accepted landmarks that are none, see `Estimator.give_states`; the same held against them."""
+        added, rows = self._estimator.give_states(seen.accepted)
+        if not rows:
+            return seen
+        self.modes.states_changed(added, rows)
+        predicted = self._estimator.predict(motion.factors)
+        return replace(seen, predicted=predicted, lines=self._lines(seen.accepted, predicted))
 
     def exclude_displaced(self, k: int, step: Step, found: InitialPose) -> list[Decision]:
         """Leave out what the search found to be moved, and no longer what it found in place."""

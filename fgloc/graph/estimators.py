@@ -94,6 +94,9 @@ class Estimator(ABC):
         self, stamp_ns: int, prior: PoseWithCovariance, sightings: Sequence[LoggedSighting] = ()
     ) -> PoseWithCovariance:
         """Begin a segment: a first pose with a prior, unconnected to what was before."""
+        if self.installation.stateless and (rows := self._occupied(sightings)):
+            self.factors.states_changed()
+            self.factors.estimated = self._anew(self.installed, rows)
         self.k += 1
         self.elapsed_s += 1e-3
         frame = Keyframe(self.k, stamp_ns, self.elapsed_s, prior, prior=prior, sightings=tuple(sightings))
@@ -244,31 +247,32 @@ class Estimator(ABC):
         mean[rows] += np.linalg.solve(A.T @ A + np.diag(1.0 / variances), A.T @ shift)
         return PoseWithCovariance(belief.pose, belief.cov, belief.cross, InstallationEstimate(mean, known.cov))
 
-    def give_states(self) -> tuple[slice, list[slice]]:
-        """Make states of the landmarks of the newest keyframe that are none.
+    def give_states(self, sightings: Sequence[LoggedSighting]) -> tuple[slice, list[slice]]:
+        """Make states of the landmarks that are none of sightings which are to be fused at the next keyframe.
 
-        Their sightings so far had the sigma of the map as noise. Where no rows are vacant, some are added; where there
-        are as many as there may be, a third of the landmarks, those not seen for longest, becomes stateless: what was
-        known of their places is forgotten. After either the newest belief begins a new window; so it is rare.
+        Where no rows are vacant, some are added; where there are as many as there may be, a third of the landmarks,
+        those not seen for longest, becomes stateless: what was known of their places is forgotten. After either the
+        newest belief begins a new window; so it is rare. Sightings of a landmark that is no state have the sigma of
+        the map as noise.
 
         Returns:
             Rows that were added to the installation, and those that are now of other landmarks.
         """
         installation, newest, added = self.installation, self.newest, slice(0, 0)
-        if not installation.stateless or newest.prior is not None:
+        if not installation.stateless:
             return added, []
-        here = dict.fromkeys(s.measurement.landmark_id for s in newest.sightings)
+        here = dict.fromkeys(s.measurement.landmark_id for s in sightings)
         before = dict.fromkeys([*(installation.landmarks.keys() - self._last_seen.keys()), *self._last_seen])
         self._last_seen = dict.fromkeys([*(i for i in before if i not in here and i in installation.landmarks), *here])
         wanted = [i for i in here if i in installation.stateless]
         gone: list[int] = []
-        if len(wanted) > installation.vacancies and self._config.kind != "isam2":
+        if len(wanted) > installation.vacancies and self._config.kind != "isam2" and newest.prior is None:
             added = installation.grow()
             if added.start == added.stop:
                 idle = [i for i in self._last_seen if i not in here]
                 gone = idle[: max(len(wanted) - installation.vacancies, len(installation.landmarks) // 3)]
         rows = [installation.vacate(i) for i in gone]
-        rows += [installation.occupy(i) for i in wanted[: installation.vacancies]]
+        rows += self._occupied(sightings)
         if not rows:
             return added, []
         self.factors.states_changed()
@@ -282,15 +286,26 @@ class Estimator(ABC):
         self._adopt(newest.belief)
         return added, rows
 
+    def _occupied(self, sightings: Sequence[LoggedSighting]) -> list[slice]:
+        """Rows of the landmarks that are made states, as long as some are vacant."""
+        seen = dict.fromkeys(s.measurement.landmark_id for s in sightings)
+        wanted = [i for i in seen if i in self.installation.stateless]
+        return [self.installation.occupy(i) for i in wanted[: self.installation.vacancies]]
+
     def _forgetful(self, belief: PoseWithCovariance, rows: Sequence[slice]) -> PoseWithCovariance:
         """The belief with nothing but their prior known of these rows of the installation."""
-        known, prior = belief.installation or self.installed, self.installation.prior()
+        known = self._anew(belief.installation or self.installed, rows)
         cross = None if belief.cross is None else belief.cross.copy()
-        for own in rows:
-            known = known.anew(np.arange(own.start, own.stop), prior.cov[own, own], prior.mean[own])
-            if cross is not None:
+        if cross is not None:
+            for own in rows:
                 cross[:, own] = 0.0
         return PoseWithCovariance(belief.pose, belief.cov, cross, known)
+
+    def _anew(self, known: InstallationEstimate, rows: Sequence[slice]) -> InstallationEstimate:
+        prior = self.installation.prior()
+        for own in rows:
+            known = known.anew(np.arange(own.start, own.stop), prior.cov[own, own], prior.mean[own])
+        return known
 
     @abstractmethod
     def _add_prior(self, rows: Sequence[slice]) -> None:
@@ -590,6 +605,8 @@ class IncrementalEstimator(Estimator):
         self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
         self._fresh = True  # nothing was given to the backend yet
         self._slots: dict[int, list[int]] = {}  # of the motion factors, by keyframe
+        self._given: list[tuple[int, list[slice]]] = []  # keyframes from whose beliefs on rows are of a landmark
+        self._known_at_start = self.installed
 
     def smoothed(self, k: int) -> FloatArray | None:  # noqa: D102
         return self._backend.pose(k) if self._backend is not None and self._backend.holds(k) else None
@@ -599,6 +616,7 @@ class IncrementalEstimator(Estimator):
             self._careful_until_s = -math.inf
             self._backend = self._new_backend()
             self._slots.clear()
+            self._known_at_start = self.installed
         initial, predicted = self._linearization(frame), frame.belief
         try:
             graph, values = self._graph_of(frame, initial, frame.prior)
@@ -669,6 +687,7 @@ class IncrementalEstimator(Estimator):
             H[:, own] = np.linalg.cholesky(more).T
             made.append(linear_factor({INSTALLATION: H}, np.zeros(len(more)), values))
         self._backend.swap(factor_graph(made), [])
+        self._given = [*((k, before) for k, before in self._given if k in self.log.keyframes), (self.k, list(rows))]
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""
@@ -823,6 +842,10 @@ class IncrementalEstimator(Estimator):
             prior = held.prior
             if i == 0 and prior is None:  # its belief holds its sightings already
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
+            if i == 0 and prior is not None and self.factors.known:
+                known = prior.installation or self._known_at_start
+                since = [own for k, rows in self._given if k > held.k for own in rows]  # they were still vacant
+                prior = self._forgetful(dataclasses.replace(prior, installation=known), since)
             start = initial if held.k == newest else PoseWithCovariance(held.belief.pose, held.belief.cov)
             graph, values = self._graph_of(held, start, prior)
             self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)

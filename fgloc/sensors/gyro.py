@@ -177,6 +177,7 @@ INSTALLATION = MotionInstallation(_parameters, lambda config: _FOUND, _settings,
 
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
+_MOST_SIGMAS = 10.0  # of the bias at the start: what is larger is no bias
 _APART_S = 2.0  # between two yaws that the bias is learned from, at least
 
 
@@ -285,7 +286,11 @@ class Gyro:
             before, spread = self._anchor
             error = math.remainder(self._turned - (yaw - before), math.tau)
             noise = self._config.yaw_per_sqrt_s**2 * self._turned_s
-            self._learn(self.bias + error / self._turned_s, (spread + variance + noise) / self._turned_s**2)
+            off, spread = error / self._turned_s, (spread + variance + noise) / self._turned_s**2
+            beyond = off**2 > chi2_bound(GATE, 1) * (self.bias_variance + spread)
+            if beyond and abs(self.bias + off) < _MOST_SIGMAS * self._config.bias_sigma:
+                self.bias_variance += off**2  # it changed, as after a shock; of a wrong fix the next one takes it back
+            self._learn(self.bias + off, spread)
         self._anchor, self._turned, self._turned_s = (yaw, variance), 0.0, 0.0
 
     def forget_fix(self) -> None:

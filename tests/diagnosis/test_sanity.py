@@ -52,6 +52,7 @@ def track_of(poses, motions, rng, known=True, ids=(1, 2, 3, 4), mirror=1.0):
         np.array([stamps[k] for k, _ in seen], dtype=np.int64),
         np.array([i for _, i in seen], dtype=np.int64),
         places,
+        np.zeros((len(seen), 2)),
         np.full(len(seen), 0.05),
         BEACONS if known else None,
         0.01,

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from test_graph import break_down
 
 from fgloc import se2
 from fgloc.config import BatchConfig, Config, EstimatorConfig
@@ -48,9 +49,9 @@ def driven(estimator, landmark_map: LandmarkMap, rng, given=True) -> list[tuple[
                 m = PointMeasurement(k, i, float(distance), float(bearing), R)
                 seen.append(estimator.factors.sighting(k, m, None))
         motion = MotionMeasurement("wheels", k - 1, k, measured, Q)
-        found.append((truth, estimator.update(k * 10**8, 0.1, [motion], seen)))
         if given:
-            estimator.give_states()
+            estimator.give_states(seen)
+        found.append((truth, estimator.update(k * 10**8, 0.1, [motion], seen)))
     return found
 
 
@@ -154,22 +155,20 @@ def test_a_map_that_has_few_landmarks_has_all_as_states():
     assert not factors.installation.stateless
     estimator = IncrementalEstimator(EstimatorConfig(), factors, keep_all=True)
     estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-4))
-    assert estimator.give_states() == (slice(0, 0), [])
+    assert estimator.give_states([]) == (slice(0, 0), [])
     assert of_whole_run(estimator.log, factors) is factors
 
 
 @pytest.mark.parametrize(("kind", "made"), [("fixed_lag", IncrementalEstimator), ("ekf", ExtendedKalmanFilter)])
-def test_landmarks_seen_from_a_first_pose_become_states_at_the_next_one(kind, made):
+def test_landmarks_seen_from_a_first_pose_are_states(kind, made):
     landmark_map = corridor(4 * MOST)
     factors = LandmarkFactors(landmark_map, installation_of(SETTINGS, landmark_map, False, most=MOST))
     estimator, landmarks = made(EstimatorConfig(kind=kind), factors), factors.installation.landmarks
-    seen = [factors.sighting(k, PointMeasurement(k, 1, math.hypot(1.0, 2.0), -1.1, R), None) for k in range(2)]
+    seen = [factors.sighting(0, PointMeasurement(0, i, math.hypot(1.0, 2.0), -1.1, R), None) for i in (1, 2)]
     estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-4), seen[:1])
-    assert estimator.give_states() == (slice(0, 0), [])
-    assert not landmarks
-    estimator.update(10**8, 0.1, [MotionMeasurement("wheels", 0, 1, np.zeros(3), Q)], seen[1:])
-    estimator.give_states()
     assert landmarks.keys() == {1}
+    estimator.give_states(seen)
+    assert landmarks.keys() == {1, 2}
 
 
 def test_a_saved_state_gives_the_landmarks_that_were_states_their_rows_again():
@@ -193,3 +192,33 @@ def test_a_saved_state_gives_the_landmarks_that_were_states_their_rows_again():
     assert known.cov[a, b] == saved.cov[before.index["map.12.y_m"]][before.index["sightings.bearing_offset_rad"]]
     other = installation_of(Config(), corridor(2 * MOST), True, most=MOST)
     assert resumed_installation(saved, other) is None
+
+
+def seen_from_rest(breaks: bool, given: bool, most: int) -> PoseWithCovariance:
+    """Belief of a robot that stands and sees two beacons from the seventh keyframe on."""
+    landmark_map = corridor(4 * MOST)
+    factors = LandmarkFactors(landmark_map, installation_of(SETTINGS, landmark_map, False, most=most))
+    estimator = IncrementalEstimator(EstimatorConfig(), factors)
+    estimator.start(0, PoseWithCovariance(np.zeros(3), np.diag([0.5, 0.5, 0.1]) ** 2))
+    motion = MotionMeasurement("wheels", 0, 1, np.zeros(3), Q)
+    for k in range(1, 20):
+        seen = [PointMeasurement(k, i, math.hypot(i, 2.0), math.atan2(2.0 - 4.0 * (i % 2), i), R) for i in (1, 2)]
+        logged = [factors.sighting(k, m, None) for m in seen if k > 6]
+        if given:
+            estimator.give_states(logged)
+        estimator.update(k * 10**8, 0.1, [motion], logged)
+    if breaks:
+        break_down(estimator)
+    belief = estimator.update(20 * 10**8, 0.1, [motion], logged if breaks else ())
+    assert estimator.rebuilt == breaks
+    return belief
+
+
+def test_a_landmark_that_becomes_a_state_counts_what_the_map_says_of_it_once():
+    one_of_many, one_of_few = seen_from_rest(False, True, MOST), seen_from_rest(False, False, 4 * MOST)
+    assert one_of_many.cov == pytest.approx(one_of_few.cov, rel=1e-3, abs=1e-9)
+
+
+def test_a_window_that_is_built_again_keeps_what_the_map_says_of_landmarks_that_became_states_in_it():
+    usual, rebuilt = (seen_from_rest(breaks, True, MOST) for breaks in (False, True))
+    assert rebuilt.cov == pytest.approx(usual.cov, rel=1e-3, abs=1e-9)

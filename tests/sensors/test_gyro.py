@@ -122,6 +122,18 @@ def test_the_bias_is_learned_between_fixes_and_as_well_as_it_says(seed):
     assert math.sqrt(gyro.bias_variance) < 0.0015
 
 
+def test_a_bias_that_changed_is_learned_again_and_a_wrong_fix_is_not_taken_for_a_change():
+    gyro = Gyro(GyroConfig())
+    drive(gyro, 0.01, 60.0, 0.5)
+    gyro.forget_fix()
+    drive(gyro, 0.06, 6.0, 0.5)
+    assert abs(gyro.bias - 0.06) < 4.0 * math.sqrt(gyro.bias_variance)
+    assert abs(gyro.bias - 0.06) < 0.01
+    wrong = Gyro(GyroConfig())
+    drive(wrong, 0.01, 60.0, 0.5, wrong_at=50.0)
+    assert abs(wrong.bias - 0.01) < 0.003
+
+
 def test_a_bias_learned_at_rest_does_not_change_the_turn_since_the_last_fix():
     """The turn was measured with the bias of then: what has been learned since must not be counted twice."""
     gyro, bias = Gyro(GyroConfig()), 0.02
