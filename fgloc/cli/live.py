@@ -235,7 +235,8 @@ def _exit_if_wrong(node: Node) -> None:
     status = node.live.status()
     wrong = [f.text for f in status.findings if f.severity is Severity.ERROR]
     if status.mode is Mode.LOST or (status.mode is None and status.keyframes):
-        wrong.append("LOST: the pose is not known")
+        lacking = f"; the run waited for {'; '.join(status.waiting_for)}" if status.waiting_for else ""
+        wrong.append(f"LOST: the pose is not known{lacking}")
     if status.stale:
         wrong.append(status.stale)
     exit_if_wrong(wrong, UNTRUSTED)

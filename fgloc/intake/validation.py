@@ -136,8 +136,8 @@ class EventValidator:
     truth, transform. Reasons: stamp_zero, duplicate_stamp; frame; non_finite, speed_bound, yaw_rate_bound, range_bound,
     position_bound, quaternion, negative_variance, asymmetric_cov, indefinite_cov (of odometry with ``pose_`` or
     ``twist_`` before them); length, position_non_finite, velocity_non_finite, effort_non_finite, position_bound,
-    wheel_rate_bound (joints); unavailable, frozen, acceleration (imu); empty, truncated (image); copy, unknown_id,
-    corners_degenerate, corners_small, bearing_bound, bearing_unit (sightings).
+    wheel_rate_bound (joints); unavailable, frozen, acceleration (imu); empty, truncated, resized (image); copy,
+    unknown_id, corners_degenerate, corners_small, bearing_bound, bearing_unit (sightings).
 
     Camera information passes unseen: whoever makes a camera of it validates it. Transforms may have stamp 0.
     """

@@ -110,7 +110,8 @@ class DetectionWorker:
     Attributes:
         detector: what finds them; may be exchanged.
         rejections: images that could not be decoded, by role and reason.
-        dropped: images dropped under overload.
+        dropped: images dropped, as too many waited.
+        early: of them those dropped before the detector was there.
         error: what ended the thread, if it was not `stop`.
     """
 
@@ -126,7 +127,7 @@ class DetectionWorker:
         use_one_thread()
         self.detector: Detector | None = None
         self.rejections: Counter[str] = Counter()
-        self.dropped = 0
+        self.dropped = self.early = 0
         self.error: Exception | None = None
         self._changed = changed
         self._most = most_waiting
@@ -152,6 +153,7 @@ class DetectionWorker:
         waiting = [q for q in self._images if q.state is not State.DETECTING]
         if len(waiting) > self._most:
             self.dropped += 1
+            self.early += self.detector is None
             self.discard(waiting[0])
 
     def discard(self, image: Queued) -> None:
@@ -219,13 +221,16 @@ _SAVE_EVERY_S = 1.0
 _COMPARE_EVERY_S = 0.5  # or less often, where nothing new is to be compared
 _COMPARED_SHARE = 0.03  # of the time, that comparisons may compute: on a slow computer they come less often ...
 _WAY_S, _LONGEST_S = 0.03, 10.0  # that a comparison waits at a time, and in all, for the steps, which come first
+_AT_THE_END_S = 2.0  # that one may go on when the run ends: on a busy machine it takes ten seconds and more
 _COMPARED_FREELY_S = 1.0  # ... beyond so much: what is wrong from the start is named as soon as it shows
 _UNFOUND = (State.WAITING, State.DETECTING)
 
 
-def overload_notes(images: int, events: int) -> tuple[str, ...]:
-    """Sentences on so many images and other events that came faster than they could be used."""
+def overload_notes(images: int, events: int, early: int = 0) -> tuple[str, ...]:
+    """Sentences on so many images and other events that came faster than they could be used, or before the run."""
     found = []
+    if early:
+        found.append(f"{early} image(s) dropped before the run, or its camera's calibration and mounting, were there")
     if images:
         found.append(
             f"{images} image(s) dropped: they come faster than markers can be found in them; poses are not those of "
@@ -245,6 +250,10 @@ class Settings:
     state: Path | None
     roles: Collection[Role] | None
     camera: Camera | None
+
+
+class _EndedError(Exception):
+    """The run ended while its signals were compared."""
 
 
 class Keep(Enum):
@@ -282,6 +291,7 @@ class Estimation:
         self._first_ns: int | None = None
         self._working = False
         self._closing = False
+        self._leave_s = math.inf  # when a comparison that goes on is left (`time.monotonic`)
         self._failed: FglocError | None = None
         self._topics = config.recording.topics
         self._worker = DetectionWorker(self._changed, config.live.image_queue, self._topics)
@@ -337,7 +347,7 @@ class Estimation:
             reordering_s = run.reordering_s
         with self._changed:
             rejections += worker.rejections
-            overload = overload_notes(worker.dropped, self._overflow)
+            overload = overload_notes(worker.dropped - worker.early, self._overflow, worker.early)
             return LiveStatus(
                 running=running,
                 mode=None if newest is None else newest.mode,
@@ -395,6 +405,7 @@ class Estimation:
         """Use what is queued, but for images, save the state, and end the threads; see `Live.close`."""
         with self._changed:
             closed, self._closing = self._closing, True
+            self._leave_s = min(self._leave_s, time.monotonic() + _AT_THE_END_S)
         self._worker.stop()  # notifies the other threads too
         for thread in self._threads:
             thread.join()
@@ -549,6 +560,8 @@ class Estimation:
 
     def _wait_until_idle(self, last_s: float) -> None:
         """Wait for a moment in which nothing is estimated or detected, but not long, nor after a time ``last_s``."""
+        if time.monotonic() > self._leave_s:
+            raise _EndedError
         if self._urgent() and time.monotonic() < last_s:
             with self._changed:
                 self._changed.wait_for(lambda: not self._urgent(), _WAY_S)
@@ -564,6 +577,8 @@ class Estimation:
                 if comparison is not None:
                     with giving_way(partial(self._wait_until_idle, time.monotonic() + _LONGEST_S)):
                         comparison()
+            except _EndedError:
+                return
             except Exception as error:
                 with self._changed:
                     self._notes.setdefault(f"sensors are not compared any more: {unexpected(error, 'the comparison')}")

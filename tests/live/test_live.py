@@ -26,10 +26,12 @@ from world_bags import write_world
 import fgloc
 from fgloc.config import Config, TopicsConfig, load_config, yaml_of
 from fgloc.errors import ConfigError, EstimatorError, ModelError, RecordingError
+from fgloc.instrumentation import give_way
 from fgloc.live import Live
 from fgloc.live import process as estimation_process
-from fgloc.live.engine import DetectionWorker, Keep, LiveStatus, Queued, Settings, State
+from fgloc.live.engine import DetectionWorker, Keep, LiveStatus, Queued, Settings, State, overload_notes
 from fgloc.live.live import begun_at
+from fgloc.live.run import OnlineRun
 from fgloc.live.state import fingerprint, read_state
 from fgloc.recording.reader import open_recording
 from fgloc.runner import run
@@ -354,7 +356,29 @@ def test_of_images_that_wait_the_oldest_gives_way_to_a_new_one():
     worker.stop()
     assert [image.event is None for image in images] == [image.state is State.GONE for image in images]
     assert [image.state for image in images] == [State.GONE] * 2 + [State.WAITING] * 3
-    assert (worker.queued, worker.dropped) == (3, 2)
+    assert (worker.queued, worker.dropped, worker.early) == (3, 2, 2)
+    [told] = overload_notes(worker.dropped - worker.early, 0, worker.early)
+    assert "faster" not in told  # no detector was there yet
+
+
+def test_a_comparison_that_goes_on_does_not_hold_up_the_end(monkeypatch):
+    """On a busy machine it took more than ten seconds: the process was killed, its last state not saved."""
+    begun, done = threading.Event(), []
+
+    def compare():
+        begun.set()
+        until_s = time.monotonic() + 15.0
+        while time.monotonic() < until_s:
+            time.sleep(0.01)
+            give_way()
+        done.append(True)
+
+    monkeypatch.setattr(OnlineRun, "comparison", lambda run: compare)
+    with Live(config(), beacons(), roles=ROLES):
+        assert begun.wait(PATIENCE_S)
+        closing_s = time.monotonic()
+    assert time.monotonic() - closing_s < 10.0
+    assert not done
 
 
 @pytest.mark.parametrize("fails", [False, True])

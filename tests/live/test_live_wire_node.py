@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from fgloc.cli.terminal import EXIT_LOST
 from fgloc.config import Config, load_config
 from fgloc.errors import WireError
 from fgloc.frames import quaternion_yaw, yaw_quaternion
-from fgloc.live import LivePose
+from fgloc.live import LivePose, LiveStatus
 from fgloc.live.wire import node, play
 from fgloc.live.wire.node import Node, Teller
 from fgloc.live.wire.outputs import SPAN_S, OdomFrame, Outputs, RecentPoses
@@ -280,6 +281,33 @@ def test_ambiguous_topics_are_an_error_and_missing_ones_are_waited_for():
         node.close()
     [waiting] = told
     assert "/left/odometry (nav_msgs/msg/Odometry)" in waiting
+
+
+def test_another_fgloc_in_the_domain_is_named():
+    """Its poses and transforms were mixed with this one's, and nothing said so."""
+    told, stop = [], threading.Event()
+    with Participant(DOMAIN) as one, Participant(DOMAIN) as other:
+        rival, node_ = Outputs(one, "map", "fgloc"), Node(other, Config(), None)
+        threading.Timer(1.5, stop.set).start()
+        node_.run(stop, told.append)
+        node_.close()
+    assert rival
+    [said] = [sentence for sentence in told if "Another fgloc publishes /fgloc/" in sentence]
+    assert "domain" in said
+
+
+def test_a_run_that_has_begun_says_what_it_still_waits_for(monkeypatch):
+    monkeypatch.setattr(node, "_PATIENCE_S", 0.3)
+    lacking = "image (/camera): no transform from base_link to 'lens' yet"
+    told, stop = [], threading.Event()
+    with Participant(DOMAIN) as participant:
+        waiting = Node(participant, Config(), None)
+        monkeypatch.setattr(waiting.intake, "find", lambda: "")
+        waiting.live = SimpleNamespace(status=lambda: LiveStatus(waiting_for=(lacking,)), close=lambda: None)
+        threading.Timer(1.2, stop.set).start()
+        waiting.run(stop, told.append)
+        waiting.close()
+    assert told == [f"Waiting for {lacking}."]
 
 
 @pytest.mark.parametrize("late", [5, 0, 2.5])

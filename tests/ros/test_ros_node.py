@@ -35,7 +35,7 @@ def test_poses_are_those_of_an_online_run_and_map_frames_and_diagnostics_are_pub
     assert drive["code"] == 0
     assert drive["markers"] > 3
     assert (drive["frames"], drive["state"]) == (["odom"], "active")
-    assert drive["diagnostics"][0] == "fgloc"
+    assert drive["diagnostics"][0] == "fgloc: localization"
     assert not [line for line in drive["log"] if "WARN" in line or "ERROR" in line]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -9,7 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fgloc.config import GateConfig
+from fgloc.intake.validation import EventValidator
 from fgloc.sensors.markers.images import ImageError, ImageEvent, decode
+from fgloc.types import Grave
 
 
 def message(data: Any, encoding: str, width: int = 0, height: int = 0, step: int = 0, big: bool = False) -> ImageEvent:
@@ -163,3 +167,21 @@ def test_fault_59_unknown_encoding_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ImageError, match=r"'tuv9'.*mono8.*yuv422") as caught:
         decode(message(b"\x00" * 16, "tuv9", 4, 4, 4))
     assert caught.value.reason == "encoding"
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_images_of_another_size_than_the_first_are_rejected_as_the_calibration_is_of_that(compressed: bool) -> None:
+    """A camera whose resolution was changed had all its sightings gated, by a calibration that is not theirs."""
+    checked = EventValidator(GateConfig())
+
+    def shot(stamp_ns: int, width: int, height: int) -> ImageEvent:
+        pixels = np.zeros((height, width), dtype=np.uint8)
+        made = message(cv2.imencode(".jpg", pixels)[1], "jpeg") if compressed else raw(pixels, "mono8")
+        return replace(made, stamp_ns=stamp_ns, received_ns=stamp_ns)
+
+    verdicts = [checked.check(shot(k + 1, *size)) for k, size in enumerate([(64, 48), (64, 48), (32, 24), (64, 48)])]
+    assert [verdict is not None for verdict in verdicts] == [True, True, False, True]
+    assert checked.rejections == {"image.resized": 1}
+    [note] = [note for note in checked.notes if "32x24" in note]
+    assert "64x48" in note
+    assert isinstance(note, Grave)

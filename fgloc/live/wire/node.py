@@ -44,6 +44,7 @@ class Intake:
         received: messages by topic.
         truth: whether a truth is read; only those who look on need it.
         mapped: whether there is a map, on which sightings alone tell the pose where nothing tells motion.
+        rival: an output topic that somebody else publishes too; empty if nobody does.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Intake:
         self.undecodable: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self.truth, self.mapped = True, False
+        self.rival = ""
         self._looked_s: float | None = None  # since when there is what sees landmarks
         self._counting = threading.Lock()
 
@@ -77,7 +79,9 @@ class Intake:
             WireError: several topics could play one role, or a configured one has another type.
         """
         own = self._transport.full_name("~/")
-        found = tuple(p for p in self._transport.publications() if not p.topic.startswith(own))
+        published = self._transport.publications()
+        found = tuple(p for p in published if not p.topic.startswith(own))
+        self.rival = next((p.topic for p in published if p.topic.startswith(own)), "")
         if found != self._found:
             self._found, self._changed_s = found, time.monotonic()
         if time.monotonic() - self._changed_s < SETTLED_S:
@@ -192,6 +196,10 @@ RATE_HZ = 50.0  # of the odometry: what controllers of wheeled robots usually as
 _ASKED_EVERY = 3  # turns: the motion sources are read at 17 Hz, which is most of the work; between, the speed is held
 _POLL_S = 0.2  # time between two looks at what there is on the wire
 _LOST = "{}: {} message(s) were lost on their way, as on a busy machine or network; poses lack what was in them."
+_RIVAL = (
+    "Another fgloc publishes {} too: whoever reads it, or /tf, gets poses of both. Give each robot a domain of its "
+    "own; one that was killed is seen for ten seconds more."
+)
 _INITIAL_POSE = "initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
@@ -303,7 +311,6 @@ class Node:
                 missing = self.intake.find()
                 if not missing and self.live is None and not self._process.ready:
                     missing = "Waiting for the process that estimates to start."
-                teller.waiting(missing)
                 if self.live is None and self.intake.roles and self._process.ready:
                     self._start()
                     publishing = threading.Thread(target=self._publish, name="fgloc-odometry", daemon=True)
@@ -312,8 +319,11 @@ class Node:
                     teller.tell(f"Subscribed: {topic} ({role}).")
                 status = None if self.live is None else self.live.status()
                 if status is not None:
-                    teller.waiting(f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
+                    missing = missing or (f"Waiting for {'; '.join(status.waiting_for)}." if status.waiting_for else "")
                     teller.tell(*status.notes)
+                teller.waiting(missing)
+                if self.intake.rival:
+                    teller.tell(_RIVAL.format(self.intake.rival))
                 teller.tell(
                     *self._take_notes(), *(_LOST.format(topic, n) for topic, n in self._transport.lost().items())
                 )

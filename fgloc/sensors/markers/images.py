@@ -33,6 +33,10 @@ class ImageEvent(RawEvent):
         """Width and height of the image; None if it is compressed."""
         return None if self.compressed else (self.width, self.height)
 
+    def stated_size(self) -> tuple[int, int] | None:
+        """Width and height by the message or the header of a JPEG or PNG; None: they are not there."""
+        return self.size or next(_stated_sizes(self.data.tobytes()), None)
+
     @property
     def empty(self) -> bool:
         """Whether the image has no data."""

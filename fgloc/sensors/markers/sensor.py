@@ -33,7 +33,7 @@ from fgloc.sensors.landmarks import planar_yaw
 from fgloc.sensors.markers.detector import dictionary_names, fitting_dictionary
 from fgloc.sensors.markers.images import CornersEvent, GrayImage, ImageEvent, MarkerCorners, decoded
 from fgloc.sensors.measurements import LandmarkSighting, PixelMeasurement
-from fgloc.types import Camera, Event, FloatArray, Landmark, RawEvent, SightingsEvent
+from fgloc.types import Camera, Event, FloatArray, Grave, Landmark, RawEvent, SightingsEvent
 
 if TYPE_CHECKING:
     from fgloc.sensors.landmarks import SightingContext
@@ -95,6 +95,26 @@ def check_image(event: ImageEvent, gate: GateConfig) -> Event | str:
     if size == 0 or (not event.compressed and (event.width <= 0 or event.height <= 0)):
         return "empty"
     return "truncated" if not event.compressed and size < event.height * event.step else event
+
+
+def image_validator(checks: FieldChecks) -> Callable[[ImageEvent], Event | str]:
+    """Validator of images: rejects those of another size than the topic's first, which the calibration is for."""
+    sizes: dict[str, tuple[int, int]] = {}
+
+    def judge(event: ImageEvent) -> Event | str:
+        verdict = check_image(event, checks.config)
+        size = None if isinstance(verdict, str) else event.stated_size()
+        if size is None or (first := sizes.setdefault(event.topic, size)) == size:
+            return verdict
+        checks.note(
+            Grave(
+                f"{event.topic}: images of {size[0]}x{size[1]} pixels are not used: the first had "
+                f"{first[0]}x{first[1]}, which the calibration is for; begin a new run after a change of resolution"
+            )
+        )
+        return "resized"
+
+    return judge
 
 
 def corners_validator(checks: FieldChecks) -> Callable[[CornersEvent], Event | str]:
@@ -347,7 +367,7 @@ MARKERS = BuiltIn(
             ImageEvent,
             {"sensor_msgs/msg/Image": from_image, "sensor_msgs/msg/CompressedImage": from_compressed_image},
             ("image_raw", "image_raw/compressed", "image", "image/compressed"),
-            check=check_image,
+            validator=image_validator,
             findings=RawChecks,
         ),
         Stream(
