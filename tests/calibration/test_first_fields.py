@@ -17,6 +17,7 @@ from fgloc.calibration.first_settings import first_settings
 from fgloc.config import GateConfig, RecordingConfig, RoleFields, config_of_file
 from fgloc.intake.validation import EventValidator
 from fgloc.recording.fields import NumericField, entries_at, events_of_role, numeric_fields, unread_numbers
+from fgloc.recording.reader import Recording
 from fgloc.recording.storage import Storage
 from fgloc.sensors.uwb import check
 from fgloc_datasets.bag import BagWriter
@@ -143,6 +144,28 @@ def test_a_number_that_is_none_at_first_is_found_all_the_same(tmp_path):
     with closing(Storage(tmp_path / "bag")) as storage:
         found = [(n.path, n.low, n.high) for n in unread_numbers(storage, (), ())]
     assert found == [("left_rpm", 1.0, 2.0), ("right_rpm", -2.0, -1.0)]
+
+
+def _ranges(path):
+    with BagWriter(path) as bag:
+        bag._store.register(get_types_from_msg("uint32 stamp\nuint8 anchor_id\nfloat32 range\n", OWN))
+        for k in range(3):
+            bag.write("/uwb", OWN, bag.make(OWN, stamp=k, anchor_id=4, range=2.0), START_NS + k)
+    return path
+
+
+def test_a_field_of_a_role_that_is_not_there_is_named_with_those_that_are(tmp_path):
+    fields = {"uwb": {"topic": "/uwb", "id": "anchor", "range": "range"}}
+    with Recording(_ranges(tmp_path / "bag"), RecordingConfig.model_validate({"fields": fields})) as recording:
+        (problem,) = recording.problems
+    assert problem.startswith("recording.fields.uwb.id: /uwb (own_msgs/msg/Wheels) has no number anchor, expected one")
+    assert problem.endswith("stamp, anchor_id, range")
+
+
+def test_a_stamp_that_is_a_number_is_no_time(tmp_path):
+    fields = {"uwb": {"topic": "/uwb", "id": "anchor_id", "range": "range"}}
+    with Recording(_ranges(tmp_path / "bag"), RecordingConfig.model_validate({"fields": fields})) as recording:
+        assert [event.stamp_ns for event in recording.events()] == [START_NS, START_NS + 1, START_NS + 2]
 
 
 def test_messages_in_messages_in_messages_do_not_take_forever():
