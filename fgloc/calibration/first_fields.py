@@ -40,19 +40,10 @@ _REVOLUTIONS = re.compile(r"(?<!e)rpm")
 _WIDTH = re.compile(r"u?int(8|16|32)$")
 _MOST_RAD = 1.6  # of a steering in radians
 _USUAL_M = 20.0  # way of a wheel in an unknown unit, to begin with
-_TURNS = (
-    0.4,
-    0.7,
-    1.2,
-    2.0,
-    3.5,
-    6.0,
-    10.0,
-)  # over those of a track of 1 m, that are tried where nothing tells the turn
+_TURNS = (0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 10.0)  # over those of a track of 1 m: tried where nothing tells the turn
 _STAYS = 0.95  # 1 less the share of its distance by which a landmark wanders, if the turn is right
 _UNSURE = 0.1  # share of a scale by which it is not known
-_OFF = 0.02  # logarithm of a scale that is as it should be
-
+_OFF = 0.02  # share by which a scale that is as it should be may differ from 1
 
 _RADIO = re.compile(r"uwb|anchor|beacon|link_?track|ranging|dwm|pozyx|decawave|transponder|(?<![a-z])toa(?![a-z])")
 _LANDMARKS = re.compile(r"(land)?mark|(april_?|s)?tag|aruco|fiducial|beacon|reflector|bearing")

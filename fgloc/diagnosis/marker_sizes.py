@@ -34,11 +34,11 @@ def marker_sizes(ids: IntArray, seen: FloatArray, expected: FloatArray, sizes: d
         one, size = factors[first], sizes[first]
         alike = [i for i, f in factors.items() if abs(math.log(f / one)) < _ALIKE and sizes[i] == size]
         factor = float(np.median([factors.pop(i) for i in alike]))
-        s, it = ("s", "their") if len(alike) > 1 else ("", "its")
+        s, their = ("s", "their") if len(alike) > 1 else ("", "its")
         text = (
-            f"Marker{s} {listed(alike)}: {it} direction fits the map in all images, {it} distance only with "
-            f"{factor:.3g} times the size, {size:.4g} m: if that was measured, give {it} size as "
-            f"{factor * size:.2g} m, in the map or to the detector that reports poses."
+            f"Marker{s} {listed(alike)}: by the images {their} side is {factor * size:.2g} m, by the map {size:.4g} m: "
+            f"{their} direction fits the map, {their} distance does not. Measure {their} side, and set it in the map, "
+            "or in the detector that reports poses."
         )
         found.append(Finding("map.sizes", text, Severity.WARNING, value=factor))
     return tuple(found)
