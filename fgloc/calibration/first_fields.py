@@ -20,6 +20,7 @@ from fgloc.diagnosis.landmark_fits import fit_sightings
 from fgloc.diagnosis.pairs import TELLS, fit_rate
 from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.diagnosis.truth import fit_body
+from fgloc.errors import ConfigError
 from fgloc.recording.fields import NumericField
 from fgloc.sensors.wheels.events import JointsEvent
 
@@ -167,7 +168,10 @@ def fit_wheels(joints: Mapping[str, JointField], signals: Signals, config: Confi
         config: with which they were read.
     """
     unit = _unit(signals, next(iter(joints)))
-    found = [one for signs in _SIGNS if (one := _turned(signals, config, joints, signs, unit)) is not None]
+    try:
+        found = [one for signs in _SIGNS if (one := _turned(signals, config, joints, signs, unit)) is not None]
+    except ConfigError:  # a run cannot use them either: their first values are no numbers
+        return FirstWheels({}, {})
     if not found:  # another motion refutes them, or there is none
         return FirstWheels({} if len(signals.imu) + len(signals.truth) > 0 else joints, {})
     _, by, path, turns, sign = max(found, key=lambda one: one[0])

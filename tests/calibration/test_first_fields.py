@@ -283,3 +283,16 @@ def test_without_anything_that_shows_the_way_the_geometry_is_asked_for(tmp_path)
     assert {*config.recording.joints} == {"left", "right"}
     assert config.wheels.left_radius is None
     assert any("radii" in sentence or "geometry" in sentence for sentence in made.missing)
+
+
+def test_wheels_without_values_for_long_are_none(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag._store.register(get_types_from_msg("float32 speed\nfloat32 steering_angle\n", OWN))
+        for k in range(100):
+            speed, steering = 1.0 + 0.1 * math.sin(k) if k > 30 else math.nan, 0.3 * math.sin(0.05 * k)
+            at_ns = START_NS + k * 50_000_000
+            bag.write("/car", OWN, bag.make(OWN, speed=speed, steering_angle=steering), at_ns)
+            bag.imu("/imu", at_ns, (0.0, 0.0, steering), (0.0, 0.0, 9.81))
+    text = first_settings(tmp_path / "bag").text
+    assert "joints" not in (yaml.safe_load(text).get("recording") or {})
+    assert "velocity: speed" in text  # for whoever knows better
