@@ -97,7 +97,6 @@ class Estimator(ABC):
         if self.installation.stateless and (rows := self._occupied(sightings)):
             self.factors.states_changed()
             self.factors.estimated = self._anew(self.installed, rows)
-            self._add_prior(rows)
         self.k += 1
         self.elapsed_s += 1e-3
         frame = Keyframe(self.k, stamp_ns, self.elapsed_s, prior, prior=prior, sightings=tuple(sightings))
@@ -679,8 +678,7 @@ class IncrementalEstimator(Estimator):
         return linear_factor({INSTALLATION: H}, np.zeros(len(rows)), values)
 
     def _add_prior(self, rows: Sequence[slice]) -> None:
-        if self._backend is None:  # the first one will begin with it
-            return
+        assert self._backend is not None
         made, prior, values = [], self.installation.prior(), gtsam.Values()
         values.insert(INSTALLATION, prior.mean[: self.installation.constants])
         for own in rows:

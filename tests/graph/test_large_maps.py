@@ -214,19 +214,6 @@ def seen_from_rest(breaks: bool, given: bool, most: int) -> PoseWithCovariance:
     return belief
 
 
-@pytest.mark.parametrize("kind", ["fixed_lag", "isam2"])
-def test_a_landmark_that_a_second_segment_begins_with_has_the_sigma_of_the_map(kind):
-    landmark_map = corridor(4 * MOST)
-    factors = LandmarkFactors(landmark_map, installation_of(SETTINGS, landmark_map, False, most=MOST))
-    estimator = IncrementalEstimator(EstimatorConfig(kind=kind), factors)
-    estimator.start(0, PoseWithCovariance(np.zeros(3), np.eye(3) * 1e-4))
-    estimator.update(10**8, 0.1, [MotionMeasurement("wheels", 0, 1, np.zeros(3), Q)])
-    seen = [factors.sighting(2, PointMeasurement(2, i, math.hypot(i, 2.0), 0.0, R), None) for i in (1, 2)]
-    estimator.start(10**12, PoseWithCovariance(np.zeros(3), np.diag([0.5, 0.5, 0.1])), seen)
-    rows = factors.installation.index["map.1.x_m"], factors.installation.index["map.2.y_m"]
-    assert all(estimator.installed.cov[i, i] < 1.01 * PLACED**2 for i in rows)
-
-
 def test_a_landmark_that_becomes_a_state_counts_what_the_map_says_of_it_once():
     one_of_many, one_of_few = seen_from_rest(False, True, MOST), seen_from_rest(False, False, 4 * MOST)
     assert one_of_many.cov == pytest.approx(one_of_few.cov, rel=1e-3, abs=1e-9)
