@@ -70,6 +70,7 @@ class Estimator(ABC):
         self.elapsed_s = 0.0
         self.contradicted: dict[str, tuple[float, float]] = {}
         self._last_seen: dict[int, None] = {}  # landmarks of a map that has more than can be states, in this order
+        self._given: list[tuple[int, list[slice]]] = []  # keyframes from whose beliefs on rows are of a landmark
 
     @property
     def installation(self) -> Installation:
@@ -97,6 +98,8 @@ class Estimator(ABC):
         if self.installation.stateless and (rows := self._occupied(sightings)):
             self.factors.states_changed()
             self.factors.estimated = self._anew(self.installed, rows)
+            if self.k >= 0 and self._config.kind == "isam2":  # the graph goes on
+                self._add_prior(rows)
         self.k += 1
         self.elapsed_s += 1e-3
         frame = Keyframe(self.k, stamp_ns, self.elapsed_s, prior, prior=prior, sightings=tuple(sightings))
@@ -286,6 +289,10 @@ class Estimator(ABC):
         self._adopt(newest.belief)
         return added, rows
 
+    def _given_since(self, k: int, end: float = math.inf) -> list[slice]:
+        """Rows that were given to landmarks from the belief of keyframe ``k`` on, before keyframe ``end``."""
+        return [own for at, rows in self._given if k <= at < end for own in rows]
+
     def _occupied(self, sightings: Sequence[LoggedSighting]) -> list[slice]:
         """Rows of the landmarks that are made states, as long as some are vacant."""
         seen = dict.fromkeys(s.measurement.landmark_id for s in sightings)
@@ -307,9 +314,9 @@ class Estimator(ABC):
             known = known.anew(np.arange(own.start, own.stop), prior.cov[own, own], prior.mean[own])
         return known
 
-    @abstractmethod
     def _add_prior(self, rows: Sequence[slice]) -> None:
         """Add the prior of landmarks in rows of the installation that were vacant."""
+        self._given = [*((k, before) for k, before in self._given if k in self.log.keyframes), (self.k, list(rows))]
 
     @abstractmethod
     def _begin_at(self, newest: Keyframe) -> None:
@@ -392,6 +399,7 @@ class Estimator(ABC):
             known = before.belief.installation or self.installed
             frame.belief = predict(before.belief, known, self.factors.installation, frame.motions)
             self._solve(frame)
+            frame.belief = self._forgetful(frame.belief, self._given_since(k, k + 1))
 
     @abstractmethod
     def _solve(self, frame: Keyframe) -> None:
@@ -459,9 +467,6 @@ class ExtendedKalmanFilter(Estimator):
 
     def _begin_at(self, newest: Keyframe) -> None:
         """Do nothing: a filter holds no earlier keyframes."""
-
-    def _add_prior(self, rows: Sequence[slice]) -> None:
-        """Do nothing: a filter's belief has the prior already."""
 
 
 # --- The two smoothers of GTSAM behind one interface ------------------------------------------------------------------
@@ -605,7 +610,6 @@ class IncrementalEstimator(Estimator):
         self._careful_until_s = -math.inf  # of the estimator's own time: by QR; Cholesky failed
         self._fresh = True  # nothing was given to the backend yet
         self._slots: dict[int, list[int]] = {}  # of the motion factors, by keyframe
-        self._given: list[tuple[int, list[slice]]] = []  # keyframes from whose beliefs on rows are of a landmark
         self._known_at_start = self.installed
 
     def smoothed(self, k: int) -> FloatArray | None:  # noqa: D102
@@ -678,6 +682,7 @@ class IncrementalEstimator(Estimator):
         return linear_factor({INSTALLATION: H}, np.zeros(len(rows)), values)
 
     def _add_prior(self, rows: Sequence[slice]) -> None:
+        super()._add_prior(rows)
         assert self._backend is not None
         made, prior, values = [], self.installation.prior(), gtsam.Values()
         values.insert(INSTALLATION, prior.mean[: self.installation.constants])
@@ -687,7 +692,6 @@ class IncrementalEstimator(Estimator):
             H[:, own] = np.linalg.cholesky(more).T
             made.append(linear_factor({INSTALLATION: H}, np.zeros(len(more)), values))
         self._backend.swap(factor_graph(made), [])
-        self._given = [*((k, before) for k, before in self._given if k in self.log.keyframes), (self.k, list(rows))]
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""
@@ -844,8 +848,8 @@ class IncrementalEstimator(Estimator):
                 prior, held = held.belief, dataclasses.replace(held, sightings=())
             if i == 0 and prior is not None and self.factors.known:
                 known = prior.installation or self._known_at_start
-                since = [own for k, rows in self._given if k > held.k for own in rows]  # they were still vacant
-                prior = self._forgetful(dataclasses.replace(prior, installation=known), since)
+                vacant = self._given_since(held.k)
+                prior = self._forgetful(dataclasses.replace(prior, installation=known), vacant)
             start = initial if held.k == newest else PoseWithCovariance(held.belief.pose, held.belief.cov)
             graph, values = self._graph_of(held, start, prior)
             self._keep_slots(held, backend.update(graph, values, held.elapsed_s), prior)

@@ -222,3 +222,47 @@ def test_a_landmark_that_becomes_a_state_counts_what_the_map_says_of_it_once():
 def test_a_window_that_is_built_again_keeps_what_the_map_says_of_landmarks_that_became_states_in_it():
     usual, rebuilt = (seen_from_rest(breaks, True, MOST) for breaks in (False, True))
     assert rebuilt.cov == pytest.approx(usual.cov, rel=1e-3, abs=1e-9)
+
+
+def in_second_segment(kind: str, most: int, breaks: bool = False) -> PoseWithCovariance:
+    """Belief of a robot that begins anew where it sees two beacons that it never saw, and later another one."""
+    landmark_map, settings = corridor(4 * MOST), SETTINGS.model_copy(update={"estimator": EstimatorConfig(kind=kind)})
+    factors = LandmarkFactors(landmark_map, installation_of(settings, landmark_map, False, most=most))
+    estimator = (ExtendedKalmanFilter if kind == "ekf" else IncrementalEstimator)(settings.estimator, factors)
+    motion = MotionMeasurement("wheels", 0, 1, np.zeros(3), Q)
+    for k, ids in enumerate([(1,), (1,), (2, 3), (2, 3, 4), (2, 3, 4), (2, 3, 4)]):
+        seen = [PointMeasurement(k, i, math.hypot(i, 2.0), math.atan2(2.0 - 4.0 * (i % 2), i), R) for i in ids]
+        logged = [factors.sighting(k, m, None) for m in seen]
+        if k in (0, 2):
+            estimator.start(k * 10**8, PoseWithCovariance(np.zeros(3), np.diag([0.5, 0.5, 0.1]) ** 2), logged)
+            continue
+        if breaks and k == 5:
+            break_down(estimator)
+        estimator.give_states(logged)
+        estimator.update(k * 10**8, 0.1, [motion], logged)
+    assert estimator.rebuilt == breaks
+    assert estimator.belief is not None
+    return estimator.belief
+
+
+@pytest.mark.parametrize(
+    ("kind", "breaks"), [("fixed_lag", False), ("fixed_lag", True), ("isam2", False), ("isam2", True), ("ekf", False)]
+)
+def test_landmarks_that_become_states_in_a_second_segment_have_the_sigma_of_the_map(kind, breaks):
+    one_of_many, one_of_few = (in_second_segment(kind, most, breaks) for most in (MOST, 4 * MOST))
+    assert one_of_many.cov == pytest.approx(one_of_few.cov, rel=1e-3, abs=1e-9)
+
+
+def test_a_filter_whose_earlier_motions_change_keeps_what_the_map_says_of_landmarks_that_became_states_since():
+    landmark_map = corridor(4 * MOST)
+    factors = LandmarkFactors(landmark_map, installation_of(SETTINGS, landmark_map, False, most=MOST))
+    estimator = ExtendedKalmanFilter(EstimatorConfig(kind="ekf"), factors)
+    estimator.start(0, PoseWithCovariance(np.zeros(3), np.diag([0.5, 0.5, 0.1]) ** 2))
+    motion = MotionMeasurement("wheels", 0, 1, np.zeros(3), Q)
+    for k in range(1, 5):
+        seen = [PointMeasurement(k, i, math.hypot(i, 2.0), math.atan2(2.0 - 4.0 * (i % 2), i), R) for i in (1, 2)]
+        logged = [factors.sighting(k, m, None) for m in seen if k > 2]
+        estimator.give_states(logged)
+        before = estimator.update(k * 10**8, 0.1, [motion], logged)
+    estimator.revise({k: [motion] for k in range(1, 5)})
+    assert estimator.belief.cov == pytest.approx(before.cov, rel=1e-6)
