@@ -28,29 +28,22 @@ _SIDES = {
     "left": re.compile(r"(?<![a-z])(left|l)(?![a-z])|(?<![a-z])l(?=wheel|motor|enc)|\[0\]"),
     "right": re.compile(r"(?<![a-z])(right|r)(?![a-z])|(?<![a-z])r(?=wheel|motor|enc)|\[1\]"),
 }
+_ASKED = r"c(om)?m(an)?d|target|set_?point|desired|goal|reference|(?<![a-z])(joy|arm)|gripper"  # or not of the robot
 _OTHER = re.compile(
-    r"pwm|current|c(om)?m(an)?d|target|set_?point|desired|goal|torque|effort|power|duty|temp|volt|error|"
-    r"bump|cliff|drop|wall|button|light|led|sonar|range|imu|gyro|accel|cam|time|stamp|seq|flag|fault|lateral|angular|joy|arm|gripper"
+    rf"{_ASKED}|pwm|current|torque|effort|power|duty|temp|volt|error|bump|cliff|drop|wall|button|light|sonar|gyro|"
+    r"accel|(?<![a-z])(led|range|imu|cam|time)|stamp|seq|flag|fault|lateral|angular"
 )
+_ENTRIES_OF_WHEELS = re.compile(r"wheel|motor|driver|enc(?![a-z])|encoder|tick|rpm|travel")  # of an array: not of cells
 _STEERING, _SPEED = re.compile(r"steer"), re.compile(r"speed|velocity")
 _A_TURN = re.compile(r"resolution|per_rev|per_turn|cpr|ppr")  # a field beside the counter, of what makes a turn
 _REVOLUTIONS = re.compile(r"(?<!e)rpm")
 _WIDTH = re.compile(r"u?int(8|16|32)$")
 _MOST_RAD = 1.6  # of a steering in radians
 _USUAL_M = 20.0  # way of a wheel in an unknown unit, to begin with
-_TURNS = (
-    0.4,
-    0.7,
-    1.2,
-    2.0,
-    3.5,
-    6.0,
-    10.0,
-)  # over those of a track of 1 m, that are tried where nothing tells the turn
+_TURNS = (0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 10.0)  # over those of a track of 1 m: tried where nothing tells the turn
 _STAYS = 0.95  # 1 less the share of its distance by which a landmark wanders, if the turn is right
 _UNSURE = 0.1  # share of a scale by which it is not known
-_OFF = 0.02  # logarithm of a scale that is as it should be
-
+_OFF = 0.02  # share by which a scale that is as it should be may differ from 1
 
 _RADIO = re.compile(r"uwb|anchor|beacon|link_?track|ranging|dwm|pozyx|decawave|transponder|(?<![a-z])toa(?![a-z])")
 _LANDMARKS = re.compile(r"(land)?mark|(april_?|s)?tag|aruco|fiducial|beacon|reflector|bearing")
@@ -59,7 +52,7 @@ _OWN_ID = re.compile(r"tag|requester|source|robot|group|frame")  # of the radio 
 _RANGE = re.compile(r"(?<![a-z])(range|dis|dist|distance)s?(_from_tag)?$")
 _BEARING = re.compile(r"(?<![a-z])(bearing|yaw|azimuth)s?$")
 _POSE = re.compile(r"\.(position|translation)\.x$")
-_OTHER_TWIST = re.compile(r"cmd|command|target|desired|imu", re.IGNORECASE)
+_OTHER_TWIST = re.compile(rf"{_ASKED}|(?<![a-z])imu", re.IGNORECASE)
 _FORWARD = re.compile(r"(?<![a-z])((linear|longitudinal)_(velocity|vel|speed|x)|linear\.x)$")
 _TURN = re.compile(r"(?<![a-z])((angular|rotational)_(velocity|vel|speed|z)|(heading|yaw|turn)_rate|angular\.z)$")
 
@@ -77,7 +70,8 @@ def find_roles(unread: Mapping[str, Mapping[str, str]], taken: Set[Role]) -> dic
         forward, turn = (
             [p for p, name in names.items() if "[" not in p and of.search(name)] for of in (_FORWARD, _TURN)
         )
-        if len(forward) == len(turn) == 1 and not taken & {"odometry", "joints"} and not _OTHER_TWIST.search(topic):
+        robot = not _OTHER_TWIST.search(" ".join((topic, *(names[p] for p in (*forward, *turn)))))
+        if len(forward) == len(turn) == 1 and robot and not taken & {"odometry", "joints"}:
             found.setdefault("odometry", RoleFields(topic=topic, forward=forward[0], turn=turn[0]))
         for id_path in (p for p, name in names.items() if _ID.search(name) and "int" in kinds[p]):
             beside = {p: name for p, name in names.items() if p != id_path and _entry(p) == _entry(id_path)}
@@ -121,7 +115,7 @@ def find_joints(numbers: Sequence[NumericField]) -> dict[str, JointField]:
     """Joints "left" and "right", or "speed" and "steering_angle", that names tell; empty: they do not."""
     moving = [n for n in numbers if n.low < n.high and not _OTHER.search(n.name)]
     pairs = [(a, b) for a in moving for b in moving if _side(a, "left") and _side(a, "left") == _side(b, "right")]
-    pairs = [(a, b) for a, b in pairs if a.is_of_wheels]
+    pairs = [(a, b) for a, b in pairs if a.is_of_wheels and not ("[0]" in a.path and _may_be_others(a, moving))]
     if pairs:
         left, right = min(pairs, key=lambda pair: pair[0].is_rate)  # angles before rates: none is lost with a message
         return {"left": _joint(left, numbers), "right": _joint(right, numbers)}
@@ -135,6 +129,12 @@ def find_joints(numbers: Sequence[NumericField]) -> dict[str, JointField]:
         scale = float(f"{math.pi / 180.0:.6g}") if degrees else 1.0
         return {"speed": _joint(speeds[0], numbers), "steering_angle": angle.model_copy(update={"scale": scale})}
     return {}
+
+
+def _may_be_others(first: NumericField, moving: Sequence[NumericField]) -> bool:
+    """Whether entries of an array may be other numbers, or more wheels than two, of which places are not known."""
+    third = first.name.replace("[0]", "[2]")
+    return not _ENTRIES_OF_WHEELS.search(first.name) or any(n.name == third for n in moving)
 
 
 def _side(number: NumericField, side: str) -> str:

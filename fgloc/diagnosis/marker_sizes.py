@@ -14,6 +14,7 @@ _OTHER = 0.15  # logarithm of a size: less is not told from a wrong place
 _SCATTER = 0.25  # share of that by which single sightings deviate, at most (median)
 _ASIDE_RAD = 0.05  # median angle from where the map has it, at most
 _NEARER = 1.3  # ratio of its largest to its smallest distance, at least: what hangs elsewhere is off by a way instead
+_LEAST_M = 1e-3  # of a distance: a detector that fails may say that the marker is where the camera is
 _ALIKE = 0.05  # logarithm by which markers of one size differ
 
 
@@ -33,11 +34,11 @@ def marker_sizes(ids: IntArray, seen: FloatArray, expected: FloatArray, sizes: d
         one, size = factors[first], sizes[first]
         alike = [i for i, f in factors.items() if abs(math.log(f / one)) < _ALIKE and sizes[i] == size]
         factor = float(np.median([factors.pop(i) for i in alike]))
-        s, it = ("s", "their") if len(alike) > 1 else ("", "its")
+        s, their = ("s", "their") if len(alike) > 1 else ("", "its")
         text = (
-            f"Marker{s} {listed(alike)}: {it} direction fits the map in all images, {it} distance only with "
-            f"{factor:.3g} times the size, {size:.4g} m: if that was measured, give {it} size as "
-            f"{factor * size:.2g} m, in the map or to the detector that reports poses."
+            f"Marker{s} {listed(alike)}: by the images {their} side is {factor * size:.2g} m, by the map {size:.4g} m: "
+            f"{their} direction fits the map, {their} distance does not. Measure {their} side, and set it in the map, "
+            "or in the detector that reports poses."
         )
         found.append(Finding("map.sizes", text, Severity.WARNING, value=factor))
     return tuple(found)
@@ -47,10 +48,10 @@ def _factor(seen: FloatArray, expected: FloatArray) -> float | None:
     """True size of a marker over the given one, by its sightings ``(m, 2)``; None: nothing shows another one."""
     if len(seen) < _FEWEST:
         return None
-    distances = np.hypot(*expected.T)
-    logs = np.log(distances / np.hypot(*seen.T))
     a, b = (p[:, 0] + 1j * p[:, 1] for p in (seen, expected))
-    aside, log = float(np.median(np.abs(np.angle(b / a)))), float(np.median(logs))
+    own, distances = (np.maximum(np.abs(p), _LEAST_M) for p in (a, b))
+    logs = np.log(distances / own)
+    aside, log = float(np.median(np.abs(np.angle(b * a.conj())))), float(np.median(logs))
     if abs(log) < _OTHER or aside > _ASIDE_RAD or distances.max() < _NEARER * distances.min():
         return None
     return math.exp(log) if float(np.median(np.abs(logs - log))) < _SCATTER * abs(log) else None

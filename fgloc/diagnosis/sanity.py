@@ -89,9 +89,8 @@ _LEAST_SCALE = 0.01  # of what wheels are off by, however well they are said to 
 _IN_ITS_PLACE = ", which is given in its place"
 _PLAIN = 0.7  # median whitened residual of sightings that fit
 
-_Sighting = tuple[
-    int, int, FloatArray, FloatArray, float
-]  # stamp, landmark, its place, the sensor's in the base, sigma
+# stamp, landmark, its place and the sensor's in the base frame, sigma
+_Sighting = tuple[int, int, FloatArray, FloatArray, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Joints in messages of any type: which field holds which angle or rate, and several topics put together."""
+"""Joints and other roles in messages of any type: which field holds which number, several topics put together."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ _MOST_WAITING = 2000  # readings of a topic that wait for those of the others
 _AGAIN_NS = 1_000_000_000  # a message received so much before the last one: the recording is read again
 _ENOUGH = 20  # messages without an event, to be told
 _DEEPEST = 8  # messages inside messages
+_MOST_PATHS = 10_000  # of a message type: twenty messages in each of twenty, and so on, are billions
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
@@ -98,14 +99,19 @@ def _as_pose(pose: Any) -> Any:
     return pose if moved is None else SimpleNamespace(position=moved, orientation=pose.rotation)
 
 
-def numeric_fields(message_type: str, definitions: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
+def numeric_fields(message_type: str, definitions: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Paths of the numbers in a message type and their types ("uint16"); ``[]`` in a path stands for each entry.
 
     Args:
         message_type: "pkg/msg/Name".
         definitions: fields of it and of the types inside it, as rosbags' typestore has them.
-        depth: of this message in others.
     """
+    looked_at = islice(_fields(message_type, definitions), _MOST_PATHS)
+    return ((path, kind) for path, kind in looked_at if kind not in ("", "string", "wstring"))
+
+
+def _fields(message_type: str, definitions: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
+    """Paths of all fields and their types; "" of messages."""
     if message_type not in definitions or depth > _DEEPEST:
         return
     for name, (kind, content) in definitions[message_type][1]:
@@ -113,10 +119,9 @@ def numeric_fields(message_type: str, definitions: Mapping[str, Any], depth: int
             continue
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
             name, (kind, content) = f"{name}[]", content[0]
+        yield name, content[0] if kind == Nodetype.BASE else ""
         if kind == Nodetype.NAME:
-            yield from ((f"{name}.{path}", of) for path, of in numeric_fields(content, definitions, depth + 1))
-        elif kind == Nodetype.BASE and content[0] not in ("string", "wstring"):
-            yield name, content[0]
+            yield from ((f"{name}.{path}", of) for path, of in _fields(content, definitions, depth + 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +193,8 @@ def unread_numbers(storage: Storage, known: Collection[str], taken: Collection[s
                 content = decoder.deserialize(message_type, raw)
                 for path in fields:
                     with suppress(IndexError):  # an array may be empty
-                        seen[path].append(value_at(content, path))
+                        if math.isfinite(value := value_at(content, path)):
+                            seen[path].append(value)
         for path, values in seen.items():
             if values:
                 yield NumericField(channel.topic, path, fields[path], min(values), max(values))

@@ -85,7 +85,7 @@ class MessageEvents:
             return []
         header = None if role in self._config.received_stamps else getattr(content, "header", content)
         stamp = getattr(header, "stamp", None)
-        stamp_ns = received_ns if stamp is None else nanoseconds(stamp)
+        stamp_ns = nanoseconds(stamp) if hasattr(stamp, "sec") else received_ns  # a stamp may be a number of any unit
         stamp_ns += round(self._config.stamp_offset_s.get(role, 0.0) * 1e9)
         if topic in self._fields.topics:
             return self._fields.events(content, (stamp_ns, received_ns, topic))
@@ -619,22 +619,31 @@ class Recording:
             ]
         return {name: TopicInfo(name, _TRANSFORM, counts[name]) for name in named & counts.keys()}, notes
 
-    def _lacking_fields(self) -> Iterator[str]:
-        """Sentences on joints whose field the topic's messages do not have."""
-        types = {topic.name: topic.message_type for topic in self.topics}
-        counts = {topic.name: topic.count for topic in self.topics}
+    def _configured_fields(self) -> Iterator[tuple[str, str, str]]:
+        """Setting, topic and path of each field that joints and other roles are made of."""
+        topics = self.config.topics
         for name, joint in self.config.joints.items():
-            if not counts.get(joint.topic) or joint.topic not in self.config.topics.of_joints:
-                continue
-            there = [path for path, _ in numeric_fields(types[joint.topic], self._decoder.store.fielddefs)]
-            shown = ", ".join(there).replace("[]", "[0]") or "none: the recording does not hold its definition"
             for key in ("position", "velocity"):
-                field = getattr(joint, key)
-                if field is not None and re.sub(r"\[\d+\]", "[]", field) not in there:
-                    yield (
-                        f"recording.joints.{name}.{key}: {joint.topic} ({types[joint.topic]}) has no number {field}, "
-                        f"expected one of {shown}"
-                    )
+                if joint.topic in topics.of_joints and (path := getattr(joint, key)) is not None:
+                    yield f"recording.joints.{name}.{key}", joint.topic, path
+        for role, fields in self.config.fields.items():
+            for key, path in fields.model_dump(exclude_none=True, exclude={"topic"}).items():
+                if topics.of_fields.get(role) == fields.topic:
+                    yield f"recording.fields.{role}.{key}", fields.topic, path
+
+    def _lacking_fields(self) -> Iterator[str]:
+        """Sentences on fields that the topic's messages do not have."""
+        types = {topic.name: topic.message_type for topic in self.topics if topic.count}
+        for setting, topic, path in self._configured_fields():
+            if topic not in types:
+                continue
+            there = [name for name, _ in numeric_fields(types[topic], self._decoder.store.fielddefs)]
+            wanted, is_pose = re.sub(r"\[\d+\]", "[]", path), setting.endswith(".pose")
+            if wanted not in there and not (is_pose and any(name.startswith(f"{wanted}.") for name in there)):
+                shown = ", ".join(there) or "none: the recording does not hold its definition"
+                shown = shown if setting.startswith("recording.fields") else shown.replace("[]", "[0]")
+                what = "pose" if is_pose else "number"
+                yield f"{setting}: {topic} ({types[topic]}) has no {what} {path}, expected one of {shown}"
 
     def decode(self, message: RawMessage, role: Role | None) -> list[Event]:
         """Events of one message in a role (None: tf); empty, and counted, if it cannot be decoded."""

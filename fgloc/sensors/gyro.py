@@ -289,7 +289,7 @@ class Gyro:
             off, spread = error / self._turned_s, (spread + variance + noise) / self._turned_s**2
             beyond = off**2 > chi2_bound(GATE, 1) * (self.bias_variance + spread)
             if beyond and abs(self.bias + off) < _MOST_SIGMAS * self._config.bias_sigma:
-                self.bias_variance += off**2  # it changed, as after a shock; of a wrong fix the next one takes it back
+                self.bias_variance += off**2  # it changed, as after a shock; after a wrong fix two more take it back
             self._learn(self.bias + off, spread)
         self._anchor, self._turned, self._turned_s = (yaw, variance), 0.0, 0.0
 

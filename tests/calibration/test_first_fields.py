@@ -1,12 +1,14 @@
 """Wheels, odometries, ranges and sightings in messages of types that fgloc does not know: what `fgloc init` writes."""
 
 import math
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 from recording_bags import OWN, START_NS
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
 
 from fgloc import run
@@ -14,7 +16,9 @@ from fgloc.calibration.first_fields import find_joints, find_roles
 from fgloc.calibration.first_settings import first_settings
 from fgloc.config import GateConfig, RecordingConfig, RoleFields, config_of_file
 from fgloc.intake.validation import EventValidator
-from fgloc.recording.fields import NumericField, entries_at, events_of_role
+from fgloc.recording.fields import NumericField, entries_at, events_of_role, numeric_fields, unread_numbers
+from fgloc.recording.reader import Recording
+from fgloc.recording.storage import Storage
 from fgloc.sensors.uwb import check
 from fgloc_datasets.bag import BagWriter
 
@@ -75,6 +79,13 @@ def numbers(*rows):
         ([("/w", "left_ticks", "int32", 5, 5), ("/w", "right_ticks", "int32", 5, 5)], {}),  # never moved
         ([("/w", "left_arm", "float32", 0, 1), ("/w", "right_arm", "float32", 0, 1)], {}),
         ([("/battery", "voltage", "float32", 11, 12)], {}),
+        ([("/battery", f"cell_rate[{k}]", "float32", 3, 4) for k in (0, 1)], {}),
+        ([("/gps", f"position[{k}]", "float64", -1, 4) for k in (0, 1)], {}),
+        ([("/motors", f"rpm[{k}]", "float32", 0, 9) for k in range(4)], {}),  # which are left is not known
+        (  # parts of other words: imu, led, range
+            [("/simulator/controlled_orange", f"{s}_ticks", "int32", 0, 900) for s in ("left", "right")],
+            {s: (f"{s}_ticks", None, 1.0, 2.0**32) for s in ("left", "right")},
+        ),
     ],
 )
 def test_names_of_fields_tell_the_wheels(rows, expected):
@@ -115,14 +126,52 @@ def test_names_of_fields_tell_other_roles(topic, kinds, role, expected):
     [
         ("/sonar", {"sonar_id": "uint8", "distance": "float32"}),  # no radio
         ("/people", {"people[].id": "int32", "people[].pose.position.x": "float64"}),  # they walk
-        ("/cmd", {"linear_velocity": "float64", "angular_velocity": "float64"}),
+        ("/target_speed", {"linear_velocity": "float64", "angular_velocity": "float64"}),
         ("/base_cmd", {"linear_x": "float32", "angular_z": "float32"}),
+        ("/controller", {"desired.linear.x": "float64", "desired.angular.z": "float64"}),
+        ("/arm/tool", {"linear.x": "float64", "angular.z": "float64"}),
     ],
 )
 def test_what_only_looks_like_it_is_left_alone(topic, kinds):
-    if topic == "/cmd":
-        topic = "/target_speed"
     assert find_roles({topic: kinds}, set()) == {}
+
+
+def test_a_number_that_is_none_at_first_is_found_all_the_same(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag._store.register(get_types_from_msg("float32 left_rpm\nfloat32 right_rpm\n", OWN))
+        for k, rpm in enumerate((math.nan, 1.0, 2.0, math.inf)):
+            bag.write("/core", OWN, bag.make(OWN, left_rpm=rpm, right_rpm=-rpm), START_NS + k)
+    with closing(Storage(tmp_path / "bag")) as storage:
+        found = [(n.path, n.low, n.high) for n in unread_numbers(storage, (), ())]
+    assert found == [("left_rpm", 1.0, 2.0), ("right_rpm", -2.0, -1.0)]
+
+
+def _ranges(path):
+    with BagWriter(path) as bag:
+        bag._store.register(get_types_from_msg("uint32 stamp\nuint8 anchor_id\nfloat32 range\n", OWN))
+        for k in range(3):
+            bag.write("/uwb", OWN, bag.make(OWN, stamp=k, anchor_id=4, range=2.0), START_NS + k)
+    return path
+
+
+def test_a_field_of_a_role_that_is_not_there_is_named_with_those_that_are(tmp_path):
+    fields = {"uwb": {"topic": "/uwb", "id": "anchor", "range": "range"}}
+    with Recording(_ranges(tmp_path / "bag"), RecordingConfig.model_validate({"fields": fields})) as recording:
+        (problem,) = recording.problems
+    assert problem.startswith("recording.fields.uwb.id: /uwb (own_msgs/msg/Wheels) has no number anchor, expected one")
+    assert problem.endswith("stamp, anchor_id, range")
+
+
+def test_a_stamp_that_is_a_number_is_no_time(tmp_path):
+    fields = {"uwb": {"topic": "/uwb", "id": "anchor_id", "range": "range"}}
+    with Recording(_ranges(tmp_path / "bag"), RecordingConfig.model_validate({"fields": fields})) as recording:
+        assert [event.stamp_ns for event in recording.events()] == [START_NS, START_NS + 1, START_NS + 2]
+
+
+def test_messages_in_messages_in_messages_do_not_take_forever():
+    inner = {f"p/msg/T{d}": ([], [(f"f{i}", (Nodetype.NAME, f"p/msg/T{d + 1}")) for i in range(20)]) for d in range(7)}
+    for last in ([("x", (Nodetype.BASE, ("float64", 0)))], [("x", (Nodetype.BASE, ("string", 0)))], []):
+        assert len([*numeric_fields("p/msg/T0", {**inner, "p/msg/T7": ([], last)})]) < 10_000
 
 
 def test_a_message_of_ranges_makes_an_event_of_each():

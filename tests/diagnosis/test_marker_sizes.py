@@ -36,3 +36,11 @@ def test_markers_that_hang_elsewhere_or_are_seen_from_one_distance_alone_are_not
     assert not named({})
     assert not named({}, moved=(1, 2, 3, 4))
     assert not named({1: 0.5}, way=0.2)
+
+
+def test_a_sighting_at_the_camera_is_one_of_many():
+    rng = np.random.default_rng(1)
+    expected = np.column_stack([np.linspace(1.0, 3.0, 20), rng.normal(0.0, 0.01, 20)])
+    seen = np.where(np.arange(20)[:, None] == 7, 0.0, 2.0 * expected)
+    (found,) = marker_sizes(np.ones(20, dtype=np.int64), seen, expected, SIZES)
+    assert found.value == pytest.approx(0.5, rel=0.02)

@@ -292,7 +292,7 @@ def test_another_fgloc_in_the_domain_is_named():
         node_.run(stop, told.append)
         node_.close()
     assert rival
-    [said] = [sentence for sentence in told if "Another fgloc publishes /fgloc/" in sentence]
+    [said] = [sentence for sentence in told if "publishes /fgloc/" in sentence]
     assert "domain" in said
 
 

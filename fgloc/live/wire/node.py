@@ -197,8 +197,9 @@ _ASKED_EVERY = 3  # turns: the motion sources are read at 17 Hz, which is most o
 _POLL_S = 0.2  # time between two looks at what there is on the wire
 _LOST = "{}: {} message(s) were lost on their way, as on a busy machine or network; poses lack what was in them."
 _RIVAL = (
-    "Another fgloc publishes {} too: whoever reads it, or /tf, gets poses of both. Give each robot a domain of its "
-    "own; one that was killed is seen for ten seconds more."
+    "Another fgloc, or a recording of one that is played, publishes {} too: whoever reads it, or /tf, gets poses of "
+    "both. Give each robot a domain of its own, and do not play these topics; one that was killed is seen for ten "
+    "seconds more."
 )
 _INITIAL_POSE = "initialpose"
 _INITIAL_POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"

@@ -124,8 +124,8 @@ def _named(
         return NamedDrive("tricycle", why, keys)
     if steering and wheels:
         rear = [name for name in wheels if not _FRONT.search(_words(name))] or wheels
-        by_side = sorted(steering, key=lambda name: bool(_RIGHT.search(_words(name))))
-        measured = (_list("wheels", rear), _list("steering_joints", by_side), "radius:  # m")
+        left_first = sorted(steering, key=lambda name: bool(_RIGHT.search(_words(name))))
+        measured = (_list("wheels", rear), _list("steering_joints", left_first), "radius:  # m")
         keys = (*(measured if wheels != ["speed"] else ()), "wheelbase:  # m")  # a speed is the default
         return NamedDrive("ackermann", f"steered by {' and '.join(steering)}", keys)
     placed = [
