@@ -226,6 +226,8 @@ def _backwards(
     for kind in ("reversed", "left_reversed", "right_reversed"):
         lines = found.right_sides(kind)
         other = found.path_with(lines) if lines else None
+        if other is not None and _spins(other, found.config):
+            continue
         again = {} if other is None else fit_sightings(other, seen)
         m = again.get("body")
         if other is not None and m is not None and _fitting({"body": m}, seen) and (_unscaled(m) or _alike(m)):
@@ -237,6 +239,12 @@ def _backwards(
         return None
     found.add("wheels.reversed", f"By the landmarks the wheels {WRONG_SIDES[kind]}", lines)
     return other, again
+
+
+def _spins(path: Path, config: Config) -> bool:
+    """Whether a path turns on average faster than robots do: any landmarks fit it somehow."""
+    turned = float(np.abs(np.diff(path.poses[:, 2])).sum())
+    return turned > config.gate.max_yaw_rate * float(path.times[-1] - path.times[0])
 
 
 def _wheels_off(

@@ -139,7 +139,8 @@ class TicksTrack(JointsTrack):
         left, right = rates.tolist()
         left, right = self._left_radius * left, self._right_radius * right
         twist = 0.5 * (left + right), 0.0, (right - left) / self._width
-        return (twist, None) if self._possible(twist, seconds, fastest) else None
+        judged = math.isfinite(fastest)  # rates as reported are taken: in another unit they have to be seen
+        return (twist, None) if not judged or self._possible(twist, seconds, fastest) else None
 
     def _places(self, names: Sequence[str]) -> list[int] | None:
         if self._wheels is None:
