@@ -691,7 +691,11 @@ class IncrementalEstimator(Estimator):
             H = np.zeros((len(more), self.installation.constants))
             H[:, own] = np.linalg.cholesky(more).T
             made.append(linear_factor({INSTALLATION: H}, np.zeros(len(more)), values))
-        self._backend.swap(factor_graph(made), [])
+        try:
+            self._backend.swap(factor_graph(made), [])
+        except _GTSAM_ERRORS:
+            self._careful_until_s = self.newest.elapsed_s + self._config.lag_s
+            self._build_again()
 
     def _solve_again(self, changed: Sequence[int]) -> None:
         """Swap the motion factors of these keyframes, as far as the window holds them."""

@@ -178,6 +178,9 @@ INSTALLATION = MotionInstallation(_parameters, lambda config: _FOUND, _settings,
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
 _MOST_SIGMAS = 10.0  # of the bias at the start: what is larger is no bias
+_UNSURE = (
+    0.4  # sigma of a bias that changed, over the change: a wrong fix shows twice, the second time by twice as much
+)
 _APART_S = 2.0  # between two yaws that the bias is learned from, at least
 
 
@@ -288,9 +291,12 @@ class Gyro:
             noise = self._config.yaw_per_sqrt_s**2 * self._turned_s
             off, spread = error / self._turned_s, (spread + variance + noise) / self._turned_s**2
             beyond = off**2 > chi2_bound(GATE, 1) * (self.bias_variance + spread)
+            unsure = 0.0
             if beyond and abs(self.bias + off) < _MOST_SIGMAS * self._config.bias_sigma:
-                self.bias_variance += off**2  # it changed, as after a shock; after a wrong fix two more take it back
+                self.bias_variance += off**2  # it changed, as after a shock, or a fix is wrong: the next ones tell
+                unsure = (_UNSURE * off) ** 2
             self._learn(self.bias + off, spread)
+            self.bias_variance = max(self.bias_variance, unsure)
         self._anchor, self._turned, self._turned_s = (yaw, variance), 0.0, 0.0
 
     def forget_fix(self) -> None:

@@ -142,6 +142,14 @@ def test_a_fix_that_is_too_wrong_for_a_bias_is_not_taken_for_a_change_of_it_and_
     assert abs(little.bias - 0.01) < 0.003
 
 
+@pytest.mark.parametrize("by", [0.1, 0.2])
+@pytest.mark.parametrize("seconds", [50.5, 52.5, 54.5])
+def test_a_wrong_fix_makes_the_bias_as_uncertain_as_it_makes_it_wrong(by, seconds):
+    gyro = Gyro(GyroConfig())
+    drive(gyro, 0.01, seconds, 0.5, wrong_at=50.5, by=by)
+    assert abs(gyro.bias - 0.01) < 4.0 * math.sqrt(gyro.bias_variance)
+
+
 def test_a_bias_learned_at_rest_does_not_change_the_turn_since_the_last_fix():
     """The turn was measured with the bias of then: what has been learned since must not be counted twice."""
     gyro, bias = Gyro(GyroConfig()), 0.02
