@@ -577,6 +577,8 @@ class RecordingConfig(Section):
             needed = _MADE[role] + (("range", "bearing") if role == "sightings" and fields.pose is None else ())
             if lacking := [key for key in needed if getattr(fields, key) is None]:
                 raise ValueError(f"fields.{role} lacks {' and '.join(lacking)}, expected the field of each")
+            if [*topics, *made.values()].count(fields.topic) > 1:
+                raise ValueError(f"{fields.topic} is in fields or joints more than once, expected one role for a topic")
         if topics != self.topics._of_joints or made != self.topics._of_fields:
             read = self.topics.model_copy()
             read._of_joints, read._of_fields = topics, made

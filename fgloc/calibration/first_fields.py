@@ -21,10 +21,9 @@ from fgloc.diagnosis.pairs import TELLS, fit_rate
 from fgloc.diagnosis.signals import Path, Signals, turn_by
 from fgloc.diagnosis.truth import fit_body
 from fgloc.errors import ConfigError
-from fgloc.recording.fields import NumericField
+from fgloc.recording.fields import NumericField, in_words
 from fgloc.sensors.wheels.events import JointsEvent
 
-_CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 _SIDES = {
     "left": re.compile(r"(?<![a-z])(left|l)(?![a-z])|(?<![a-z])l(?=wheel|motor|enc)|\[0\]"),
     "right": re.compile(r"(?<![a-z])(right|r)(?![a-z])|(?<![a-z])r(?=wheel|motor|enc)|\[1\]"),
@@ -67,7 +66,7 @@ def find_roles(unread: Mapping[str, Mapping[str, str]], taken: Set[Role]) -> dic
     """
     found: dict[str, RoleFields] = {}
     for topic, kinds in sorted(unread.items()):
-        names = {path: _CAMEL.sub("_", path).lower().replace("[]", "") for path in kinds}
+        names = {path: in_words(path).replace("[]", "") for path in kinds}
         forward, turn = (
             [p for p, name in names.items() if "[" not in p and of.search(name)] for of in (_FORWARD, _TURN)
         )
@@ -78,7 +77,7 @@ def find_roles(unread: Mapping[str, Mapping[str, str]], taken: Set[Role]) -> dic
             beside = {p: name for p, name in names.items() if p != id_path and _entry(p) == _entry(id_path)}
             ranges, bearings = ([p for p, name in beside.items() if of.search(name)] for of in (_RANGE, _BEARING))
             poses = [p[: m.start()] for p in kinds if (m := _POSE.search(p)) and _entry(p) == _entry(id_path)]
-            about = _CAMEL.sub("_", " ".join((topic, *kinds))).lower()
+            about = in_words(" ".join((topic, *kinds)))
             role, fields = "", {}
             if len(ranges) == len(bearings) == 1:
                 role, fields = "sightings", {"range": ranges[0], "bearing": bearings[0]}
@@ -87,7 +86,9 @@ def find_roles(unread: Mapping[str, Mapping[str, str]], taken: Set[Role]) -> dic
             elif len(ranges) == 1 and not poses and not _OWN_ID.search(names[id_path]):
                 role, fields = "uwb", {"range": ranges[0]}
             usual = _RADIO if role == "uwb" else _LANDMARKS
-            if role and usual.search(about) and not taken & ({"uwb"} if role == "uwb" else {"image", "sightings"}):
+            free = topic not in {one.topic for one in found.values()}  # a topic plays one role
+            free &= not taken & ({"uwb"} if role == "uwb" else {"image", "sightings"})
+            if role and free and usual.search(about):
                 found.setdefault(role, RoleFields(topic=topic, id=id_path, **fields))
     return found
 

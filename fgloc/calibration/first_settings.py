@@ -286,7 +286,8 @@ def _look(bag: Path) -> _Seen:
     with closing(Storage(bag)) as storage:
         numbers = () if _WHEELED & roles.keys() else _numbers(storage, known, roles.values())
         made = find_roles(unread_paths(storage, known, roles.values()), {*map(base_role, roles)})
-    wheels = FirstWheels({} if "odometry" in made else find_joints(numbers), {})
+    free = [n for n in numbers if n.topic not in {fields.topic for fields in made.values()}]
+    wheels = FirstWheels({} if "odometry" in made else find_joints(free), {})
     config = with_value(config, "recording", _read_by_fields(wheels, made))
     if wheels.joints:
         with Recording(bag, config.recording) as recording:

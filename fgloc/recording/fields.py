@@ -39,6 +39,11 @@ _MOST_PATHS = 10_000  # of a message type: twenty messages in each of twenty, an
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
+def in_words(name: str) -> str:
+    """The name in small letters, words of camel case apart: ``leftWheel`` as ``left_wheel``."""
+    return _CAMEL.sub("_", name).lower()
+
+
 def value_at(content: Any, path: str) -> float:
     """Number in a message, by its path, such as ``point.x`` or ``data[0]``.
 
@@ -136,8 +141,8 @@ class NumericField:
 
     @property
     def name(self) -> str:
-        """Name of its topic and its path, without camel case."""
-        return _CAMEL.sub("_", f"{self.topic} {self.path}").lower()
+        """Name of its topic and its path, as `in_words` has it."""
+        return in_words(f"{self.topic} {self.path}")
 
     @property
     def is_of_wheels(self) -> bool:

@@ -178,9 +178,7 @@ INSTALLATION = MotionInstallation(_parameters, lambda config: _FOUND, _settings,
 _MAX_GAP_S = 0.1  # over a longer silence the turn is not known
 _AT_REST_S = 0.3  # that the wheels have stood before the robot is taken to stand
 _MOST_SIGMAS = 10.0  # of the bias at the start: what is larger is no bias
-_UNSURE = (
-    0.4  # sigma of a bias that changed, over the change: a wrong fix shows twice, the second time by twice as much
-)
+_UNSURE = 0.4  # sigma of a bias that changed, over the change: a wrong fix shows twice, then by twice as much
 _APART_S = 2.0  # between two yaws that the bias is learned from, at least
 
 

@@ -296,3 +296,18 @@ def test_wheels_without_values_for_long_are_none(tmp_path):
     text = first_settings(tmp_path / "bag").text
     assert "joints" not in (yaml.safe_load(text).get("recording") or {})
     assert "velocity: speed" in text  # for whoever knows better
+
+
+def test_a_topic_plays_one_role():
+    odometry = {"topic": "/a", "forward": "v", "turn": "w"}
+    with pytest.raises(ValueError, match="one role for a topic"):
+        RecordingConfig.model_validate(
+            {"fields": {"odometry": odometry, "uwb": {"topic": "/a", "id": "i", "range": "r"}}}
+        )
+    with pytest.raises(ValueError, match="one role for a topic"):
+        RecordingConfig.model_validate(
+            {"joints": {"left": {"topic": "/a", "position": "l"}}, "fields": {"odometry": odometry}}
+        )
+    both = {"linear_velocity": "float64", "angular_velocity": "float64", "anchor_id": "uint8", "range": "float64"}
+    found = find_roles({"/status": both}, set())
+    assert len(found) == 1

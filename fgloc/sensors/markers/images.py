@@ -35,7 +35,7 @@ class ImageEvent(RawEvent):
 
     def stated_size(self) -> tuple[int, int] | None:
         """Width and height by the message or the header of a JPEG or PNG; None: they are not there."""
-        return self.size or next(_stated_sizes(self.data.tobytes()), None)
+        return self.size or next(_stated_sizes(self.data[:_HEADER_BYTES].tobytes()), None)
 
     @property
     def empty(self) -> bool:
@@ -109,6 +109,7 @@ _MAX_SCANS = 64  # of a progressive JPEG; cameras write up to 12, and each of th
 
 _JPEG_START, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
 _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
+_HEADER_BYTES = 1 << 16  # of a JPEG or PNG, within which its size usually stands
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
