@@ -227,14 +227,15 @@ def _with_initial_pose(config: Config, text: str | None) -> Config:
 
 
 def _exit_if_wrong(node: Node) -> None:
-    """End with the code of a run that is not to be trusted, and say why: errors, or a last pose that is not of now."""
+    """End with the code of a run that is not to be trusted, and say why: errors, or no pose, or one that is not of now."""
     from fgloc.types import Mode, Severity
 
     if node.live is None:
+        exit_if_wrong(["no pose was found: the robot's topics were not there"], UNTRUSTED)
         return
     status = node.live.status()
     wrong = [f.text for f in status.findings if f.severity is Severity.ERROR]
-    if status.mode is Mode.LOST or (status.mode is None and status.keyframes):
+    if status.mode in (None, Mode.LOST):
         lacking = f"; the run waited for {'; '.join(status.waiting_for)}" if status.waiting_for else ""
         wrong.append(f"LOST: the pose is not known{lacking}")
     if status.stale:
