@@ -227,7 +227,7 @@ def _with_initial_pose(config: Config, text: str | None) -> Config:
 
 
 def _exit_if_wrong(node: Node) -> None:
-    """End with the code of a run that is not to be trusted, and say why: errors, or no pose, or one that is not of now."""
+    """End with code 3 after errors, without a pose, or with one that is not of now, and say why."""
     from fgloc.types import Mode, Severity
 
     if node.live is None:
