@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import mmap
 import threading
 import time
 from collections import Counter, deque
@@ -225,7 +226,7 @@ _COMPARED_SHARE = 0.03  # of the time, that comparisons may compute: on a slow c
 _WAY_S, _LONGEST_S = 0.03, 10.0  # that a comparison waits at a time, and in all, for the steps, which come first
 _AT_THE_END_S = 2.0  # that one may go on when the run ends: on a busy machine it takes ten seconds and more
 _COMPARED_FREELY_S = 1.0  # ... beyond so much: what is wrong from the start is named as soon as it shows
-_RELEASE_EVERY_S = 10.0  # takes 1 to 2 ms; without it 25 MB of the heap stay that were used for a moment
+_GROWN_MB, _HEAP_EVERY_S = 4.0, 0.5  # memory since the heap was last given back, which takes 1 to 2 ms
 _UNFOUND = (State.WAITING, State.DETECTING)
 
 
@@ -432,12 +433,14 @@ class Estimation:
 
     @one_blas_thread
     def _estimate(self) -> None:
+        heap = _Heap()
         try:
             while (batch := self._next_batch()) is not None:
                 with self._busy:
                     for item in batch:
                         self._take(item)
                     self._use_line()
+                heap.give_back()
                 with self._changed:
                     self._working = False
                     self._changed.notify_all()
@@ -572,11 +575,7 @@ class Estimation:
     def _compare_regularly(self) -> None:
         """Compare signals beside the estimation, which goes on meanwhile, also where this fails."""
         began, free_s = time.monotonic(), _COMPARED_FREELY_S
-        released_s = began
         while self._pause(max(_COMPARE_EVERY_S, -free_s / _COMPARED_SHARE)):
-            if time.monotonic() - released_s > _RELEASE_EVERY_S:
-                released_s = time.monotonic()
-                _release_heap()
             computed = time.thread_time()
             with self._busy:
                 comparison = self.run.comparison()
@@ -605,10 +604,28 @@ class Estimation:
                     self._notes.setdefault(str(error))
 
 
-def _release_heap() -> None:
-    """Give memory that is free to the system, where the C library can (glibc does not by itself)."""
-    with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)
+class _Heap:
+    """Gives memory that was used for a moment back to the system, where the C library can; glibc keeps some 25 MB."""
+
+    def __init__(self) -> None:
+        self._looked_s = time.monotonic()
+        self._least_mb = math.inf
+
+    def give_back(self) -> None:
+        """Do so if this process has grown; call it often."""
+        if (now := time.monotonic()) - self._looked_s < _HEAP_EVERY_S:
+            return
+        self._looked_s = now
+        with suppress(AttributeError, OSError, TypeError):  # another system, or another C library
+            if (resident := _resident_mb()) > self._least_mb + _GROWN_MB:
+                ctypes.CDLL(None).malloc_trim(0)
+                self._least_mb = _resident_mb()
+            else:
+                self._least_mb = min(self._least_mb, resident)
+
+
+def _resident_mb() -> float:
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * mmap.PAGESIZE * 1e-6
 
 
 def _started(name: str, work: Callable[[], None]) -> threading.Thread:
