@@ -273,7 +273,8 @@ def _uses() -> dict[str, set[tuple[str, int]]]:
 def _tests_of(mutant: Mutant, tests: TestMap) -> list[str]:
     places = {(str(mutant.file), line) for line in range(mutant.line, mutant.last_line + 1)}
     for name in mutant.names:
-        places |= _uses().get(name, set())
+        own = name.startswith("_")  # others of this name are other constants
+        places |= {place for place in _uses().get(name, set()) if not own or place[0] == str(mutant.file)}
     return tests.of(places)
 
 

@@ -10,6 +10,7 @@ from command_line import fgloc
 from fgloc import se2
 from fgloc.calibration.anchors import survey_anchors
 from fgloc.config import config_of, config_of_file, load_config
+from fgloc.diagnosis.mistakes import inspect_all
 from fgloc.errors import ConfigError, RecordingError
 from fgloc.runner import run
 from fgloc.sensors.maps import load_map
@@ -32,7 +33,7 @@ def straight(seconds):
     return 0.0
 
 
-def write(folder, rate=eight, wrong=0.0, seldom=(), places=PLACES, steps=STEPS):
+def write(folder, rate=eight, wrong=0.0, seldom=(), places=PLACES, steps=STEPS, unit_m=1.0):
     """Bag of odometry that begins at the origin, ranges in turn, and a truth in a frame of its own.
 
     Returns:
@@ -48,7 +49,7 @@ def write(folder, rate=eight, wrong=0.0, seldom=(), places=PLACES, steps=STEPS):
             if number not in seldom or k < 40:
                 length = math.dist((*pose[:2], 0.0), places[number]) + rng.normal(0.0, NOISE_M)
                 length += rng.uniform(1.0, 5.0) if rng.random() < wrong else 0.0
-                bag.range_reading("/ranges", stamp, length, f"anchor_{number}")
+                bag.range_reading("/ranges", stamp, length / unit_m, f"anchor_{number}")
             bag.planar_truth("/truth", stamp, se2.compose(TRUTH_FRAME, pose))
             poses.append(pose)
             turn = omega * STEP_NS * 1e-9
@@ -96,6 +97,24 @@ def test_an_anchor_that_is_heard_too_seldom_is_left_out(tmp_path):
     found = survey_anchors(bag, config_of({}))
     assert sorted(found.landmarks.landmarks) == [1, 2, 3]
     assert found.left_out == {4: "10 ranges, needed are 20"}
+
+
+def test_ranges_in_millimetres_are_named_though_two_anchors_share_a_place(tmp_path):
+    places = PLACES | {4: PLACES[1]}
+    bag, _ = write(tmp_path, places=places, unit_m=0.001)
+    (found,) = [
+        f for f in inspect_all(bag, None, config_of({"uwb": {"anchors": places}})).found if f.code == "uwb.unit"
+    ]
+    assert found.lines == {"uwb.unit_m": "0.001"}
+
+
+def test_anchors_are_above_the_tag(tmp_path):
+    """Ranges on a floor tell the difference of heights and not its sign."""
+    bag, _ = write(tmp_path, places={i: (x, y, 2.5) for i, (x, y, _) in PLACES.items()})
+    found = survey_anchors(bag, config_of({"uwb": {"tag": (0.0, 0.0, 1.0)}})).landmarks.landmarks
+    heights = [m.position[2] for m in found.values()]
+    assert min(heights) > 0.99  # of those beyond 10 m nothing tells it
+    assert max(heights) > 2.5
 
 
 def test_given_anchors_make_the_frame_and_stay(tmp_path):

@@ -32,6 +32,10 @@ def numbers(*rows):
 @pytest.mark.parametrize(
     ("rows", "expected"),
     [
+        (
+            [("/m", "leftRpm", "float32", 0, 90), ("/m", "rightRpm", "float32", 0, 95)],
+            {"left": (None, "leftRpm", math.tau / 60, None), "right": (None, "rightRpm", math.tau / 60, None)},
+        ),
         (  # Kobuki: counters of 16 bits among pulse widths and bumpers
             [
                 ("/core", "left_encoder", "uint16", 0, 65535),
@@ -58,10 +62,6 @@ def numbers(*rows):
                 ("/wheel_ticks", "ticks_right", "int32", 0, 900),
             ],
             {s: (f"ticks_{s}", None, 1.0, 2.0**32) for s in ("left", "right")},
-        ),
-        (
-            [("/m", "leftRpm", "float32", 0, 90), ("/m", "rightRpm", "float32", 0, 95)],
-            {"left": (None, "leftRpm", math.tau / 60, None), "right": (None, "rightRpm", math.tau / 60, None)},
         ),
         (
             [("/lwheel", "data", "int16", -9, 900), ("/rwheel", "data", "int16", -9, 900)],
@@ -285,6 +285,33 @@ def test_without_anything_that_shows_the_way_the_geometry_is_asked_for(tmp_path)
     assert any("radii" in sentence or "geometry" in sentence for sentence in made.missing)
 
 
+def _car(path, truth=True):
+    """A bag of a car with a wheelbase of 0.33 m: speeds that are 1.25 times the true ones, steering to the right."""
+    t, v, w, x, y, yaw = (values[: round(25.0 / 0.05)] for values in _motion(0.05))
+    with BagWriter(path) as bag:
+        bag._store.register(get_types_from_msg("float32 speed\nfloat32 steering_angle\n", OWN))
+        for k, (at, speed, turn) in enumerate(zip(t, v, w, strict=True)):
+            at_ns = START_NS + round(at * 1e9)
+            steering = -math.atan2(turn * 0.33, speed) if speed > 0.0 else 0.0
+            bag.write("/car", OWN, bag.make(OWN, speed=1.25 * speed, steering_angle=steering), at_ns)
+            if truth:
+                bag.planar_truth("/ground_truth", at_ns, (x[k], y[k], yaw[k]))
+    return path
+
+
+def test_a_car_whose_steering_counts_to_the_right_is_measured(tmp_path):
+    config = config_of_file(yaml.safe_load(first_settings(_car(tmp_path / "bag")).text))
+    joints = config.recording.joints
+    assert (config.wheels.drive.kind, joints["steering_angle"].scale) == ("ackermann", -1.0)
+    assert config.wheels.drive.wheelbase == pytest.approx(0.33, rel=0.05)
+    assert joints["speed"].scale == pytest.approx(0.8, rel=0.03)
+
+
+def test_wheels_that_nothing_can_refute_are_kept(tmp_path):
+    found = yaml.safe_load(first_settings(_car(tmp_path / "bag", truth=False)).text)
+    assert {*found["recording"]["joints"]} == {"speed", "steering_angle"}
+
+
 def test_wheels_without_values_for_long_are_none(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag._store.register(get_types_from_msg("float32 speed\nfloat32 steering_angle\n", OWN))
@@ -295,7 +322,7 @@ def test_wheels_without_values_for_long_are_none(tmp_path):
             bag.imu("/imu", at_ns, (0.0, 0.0, steering), (0.0, 0.0, 9.81))
     text = first_settings(tmp_path / "bag").text
     assert "joints" not in (yaml.safe_load(text).get("recording") or {})
-    assert "velocity: speed" in text  # for whoever knows better
+    assert "velocity: speed" in text.partition("\n  # joints:")[2]  # for whoever knows better
 
 
 def test_a_topic_plays_one_role():

@@ -49,9 +49,16 @@ def moved(kind, t):
 
 
 def drive(
-    folder, kind, told=lambda t, wheels, steering: (wheels, steering), *, gyro=True, landmarks=False, rates=False
+    folder,
+    kind,
+    told=lambda t, wheels, steering: (wheels, steering),
+    *,
+    gyro=True,
+    landmarks=False,
+    rates=False,
+    left=1.0,
 ):
-    """A recording whose joints report what `told` makes of their positions (or rates)."""
+    """A recording whose joints report what `told` makes of their positions (or rates); bearings count by ``left``."""
     names, rng, pose = [*configured(kind).wheels.drive.driven], np.random.default_rng(3), np.zeros(3)
     names += configured(kind).wheels.drive.steered
     angles = np.zeros(len(moved(kind, 0.0)[1]))
@@ -66,7 +73,9 @@ def drive(
                 bag.imu("/imu", stamp, (0.0, 0.0, twist[2] + rng.normal(0.0, 0.003)), (0.0, 0.0, 9.81))
             if landmarks and k % 2 == 0:
                 seen = ((i, se2.between(pose, (*place, 0.0))) for i, place in enumerate(BEACONS))
-                bag.range_bearing("/tags", stamp, [(i, math.hypot(*p[:2]), math.atan2(p[1], p[0])) for i, p in seen])
+                bag.range_bearing(
+                    "/tags", stamp, [(i, math.hypot(*p[:2]), math.atan2(left * p[1], p[0])) for i, p in seen]
+                )
             angles, pose = angles + 0.05 * turning, se2.compose(pose, se2.exp(0.05 * twist))
     return folder
 
@@ -116,8 +125,8 @@ def test_sound_wheels_have_nothing_to_say(tmp_path, kind, recorded):
     assert said(drive(tmp_path / "bag", kind, **recorded), configured(kind)) == {}
 
 
-@pytest.mark.parametrize("from_s", [0.0, 8.0])
-def test_a_wheel_that_stands_while_the_others_turn_is_named(tmp_path, from_s):
+@pytest.mark.parametrize(("kind", "from_s"), [("mecanum", 0.0), ("mecanum", 8.0), ("skid", 0.0)])
+def test_a_wheel_that_stands_while_the_others_turn_is_named(tmp_path, kind, from_s):
     frozen = []
 
     def told(t, wheels, steering):
@@ -126,8 +135,20 @@ def test_a_wheel_that_stands_while_the_others_turn_is_named(tmp_path, from_s):
             wheels[2] = frozen[0]
         return wheels, steering
 
-    folder = drive(tmp_path / "bag", "mecanum", told)
-    assert said(folder, configured("mecanum"), Severity.WARNING) == {"wheels.still": {}}
+    folder = drive(tmp_path / "bag", kind, told)
+    assert said(folder, configured(kind), Severity.WARNING) == {"wheels.still": {}}
+
+
+def test_wheels_that_contradict_each_other_a_little_still_tell_of_the_sightings(tmp_path):
+    """A wheel that stands for the last quarter, and bearings that count to the right."""
+    last = []
+
+    def told(t, wheels, steering):
+        last[:] = last if t > 15.0 else [wheels[2]]
+        return np.array([*wheels[:2], last[0], *wheels[3:]]), steering
+
+    folder = drive(tmp_path / "bag", "mecanum", told, landmarks=True, left=-1.0)
+    assert list(said(folder, configured("mecanum"))) == ["sightings.mirrored"]
 
 
 def test_two_mistakes_that_explain_as_much_are_both_named_without_a_line(tmp_path):

@@ -240,6 +240,18 @@ def test_a_watch_forgets_what_was_sound_more_than_two_minutes_ago():
     assert out[-1].mode is Mode.DEAD_RECKONING
 
 
+def test_a_watch_still_sees_an_estimate_depart_after_poses_that_are_not_finite():
+    poses, motions, _ = driven(n=1400)
+    given = list(poses[:400])
+    for motion in motions[400:]:
+        given.append(se2.compose(given[-1], motion * [2.0, 1.0, 1.0]))
+    given = np.array(given)
+    given[600:660] = math.nan
+    _, out = watched(poses, given, motions)
+    assert out[1100].mode is Mode.DEAD_RECKONING
+    assert np.isfinite([e.pose for e in out]).all()
+
+
 def test_a_watch_is_causal():
     poses, motions, _ = driven()
     given = poses.copy()

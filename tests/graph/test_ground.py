@@ -106,6 +106,12 @@ def test_a_height_is_less_sure_where_the_slope_changes_and_not_on_a_steady_one()
     assert bent > 2.0 * level
 
 
+def test_the_height_of_a_standing_robot_does_not_become_surer() -> None:
+    """Else its covariance would be singular, or no covariance, after a while."""
+    assert np.linalg.eigvalsh(step([0.0, 0.0, 0.0], (0.0, 0.0, 0.0), reading([0.0, 0.0])).cov)[0] > 0.0
+    assert step([0.0, 0.0, 0.0], (0.0, 0.0, 0.0)).cov[0, 0] > 0.0
+
+
 def step(motion, ground, inertial=None, of: Installation | None = None, theta=None):
     of = of or installation()
     motions = [moved(motion, inertial)]

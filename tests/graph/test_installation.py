@@ -30,8 +30,8 @@ from fgloc.graph.batch import BatchSmoother
 from fgloc.graph.estimators import ExtendedKalmanFilter, IncrementalEstimator
 from fgloc.graph.factors import LandmarkFactors
 from fgloc.graph.ground import predict
-from fgloc.graph.installation import Installation, InstallationEstimate, installation_of
-from fgloc.graph.joint import correct, fuse_installed
+from fgloc.graph.installation import MARKER, BoardPrior, Installation, InstallationEstimate, installation_of
+from fgloc.graph.joint import conditioned, correct, fuse_installed
 from fgloc.graph.measurement_log import PoseWithCovariance
 from fgloc.sensors.equipment import MotionSensors
 from fgloc.sensors.gyro import Gyro, ImuEvent
@@ -69,6 +69,31 @@ def test_a_covariance_of_the_map_is_the_prior_of_its_landmark():
         assert count == 2
         assert made.prior().cov[first : first + 2, first : first + 2] == pytest.approx(cov)
     assert made.names == ("map.1.x_m", "map.1.y_m")
+
+
+def test_markers_of_a_board_that_are_states_are_displaced_together():
+    """Of a board of three, the second is no state: it was never given a size, say."""
+    rng = np.random.default_rng(4)
+    derivative, root = rng.normal(size=(18, 6)), 0.01 * rng.normal(size=(6, 6))
+    board = BoardPrior((7, 8, 9), derivative, root @ root.T, np.full(6, 1e-6))
+    sigmas = {f"map.{i}.{name}": 0.05 for i in (9, 7) for name in MARKER}
+    prior = Installation(sigmas, boards=(board,)).prior().cov
+    rows = np.r_[12:18, 0:6]  # of the board's, in the order of the states
+    np.testing.assert_allclose(prior, board.joint(rows), atol=1e-15)
+
+
+@pytest.mark.parametrize("sigma", [1e-7, 1.5e-5, 1e-3, 1.0])
+def test_states_that_are_taken_as_exact_keep_a_covariance_and_tell_the_others(sigma):
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(4, 4)) * np.array([1.0, 1.0, sigma, 1.0])[:, None]
+    P = root @ root.T
+    found = conditioned(P, [2])
+    assert np.linalg.eigvalsh(found)[0] > -1e-15
+    assert 0.0 <= found[2, 2] <= 1.01e-10
+    if sigma > 1e-4:  # else it is more certain than what is called exact
+        rest = [0, 1, 3]
+        expected = P[np.ix_(rest, rest)] - np.outer(P[rest, 2], P[rest, 2]) / P[2, 2]
+        np.testing.assert_allclose(found[np.ix_(rest, rest)], expected, atol=1e-3)
 
 
 def test_what_is_a_state_depends_on_the_sensors():

@@ -73,6 +73,27 @@ def test_an_argument_of_another_shape_is_named_with_its_value(method, arguments,
     assert repr(value) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("method", "arguments", "expected"),
+    [
+        ("odometry", (T, (1.0, 2.0)), "pose is (1.0, 2.0); expected 3 numbers"),
+        ("odometry", (T, (0.0, 0.0, 0.0), (0.2,)), "twist is (0.2,); expected 3 numbers"),
+        ("command", (T, 0.1, (0.2,)), "omega is (0.2,); expected 1 number:"),
+        ("imu", (T, (0.1,)), "angular_velocity is (0.1,); expected 3 numbers"),
+        ("imu", (T, (0.0, 0.0, 0.1), (9.8,)), "linear_acceleration is (9.8,); expected 3 numbers"),
+        ("ranges", (T, [(1, 2.0)]), "expected n x 3 numbers"),
+        ("corners", (T, {7: [(1.0, 2.0)]}), "expected 4 x 2 numbers"),
+        ("camera_info", (640, 480, (1.0, 2.0)), "expected 3 x 3 numbers"),
+        ("camera_info", (640, 480, np.eye(3), "no"), "expected n numbers"),
+        ("transform", ("base_link", "cam", (1.0,), (0.0, 0.0, 0.0, 1.0)), "translation is (1.0,); expected 3 numbers"),
+        ("transform", ("base_link", "cam", (0.0, 0.0, 1.0), (1.0,)), "rotation is (1.0,); expected 4 numbers"),
+    ],
+)
+def test_the_first_argument_that_has_not_its_shape_is_named_with_the_shape(method, arguments, expected):
+    with Live(Config(), roles=ODOMETRY) as live, pytest.raises(EstimatorError, match=re.escape(expected)):
+        getattr(live, method)(*arguments)
+
+
 def test_a_call_without_its_arguments_is_pythons_own_error():
     with Live(Config(), roles=ODOMETRY) as live, pytest.raises(TypeError):
         live.odometry()

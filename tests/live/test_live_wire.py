@@ -15,6 +15,7 @@ from fgloc.config import RecordingConfig, TopicsConfig, role_names
 from fgloc.errors import WireError
 from fgloc.live.wire import node, play
 from fgloc.live.wire.node import Intake
+from fgloc.live.wire.outputs import Outputs
 from fgloc.live.wire.participant import (
     CLOCK,
     CLOCK_TYPE,
@@ -86,6 +87,26 @@ def test_types_on_the_wire_are_those_of_the_definitions():
         assert wait_until(lambda: set(other.publications()) == expected)
         assert one.publications() == ()  # its own are not input
         assert len(writers) == len(kinds)
+
+
+class Announced:
+    """Network that stores how topics are announced."""
+
+    def __init__(self):
+        self.latched = {}
+
+    def full_name(self, name):
+        return name.replace("~", "/fgloc")
+
+    def writer(self, topic, message_type, latched=False):
+        self.latched[topic] = latched
+
+
+def test_a_late_reader_gets_the_map_and_no_old_pose():
+    network = Announced()
+    Outputs(network)
+    assert {topic for topic, latched in network.latched.items() if latched} == {"/fgloc/map"}
+    assert len(network.latched) > 4
 
 
 def test_what_was_written_before_reaches_late_readers_of_a_latched_topic_only():

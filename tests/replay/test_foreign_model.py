@@ -74,6 +74,17 @@ def test_a_model_that_was_never_right_accuses_no_sound_wheels(gyro):
     assert not {"quarantined", "landmark_moved"} & {reason for _, reason in reasons}
 
 
+def test_the_doubted_stretch_is_revised_once_sightings_contradict_the_model():
+    """The motions of its steps enter the graph anew, without the model."""
+    config = with_values(load_config(SAMPLE / "robot.yaml"), "motion", {"model": MODEL})
+    config = with_values(config, "gyro", {"use": False})
+    result = run(SAMPLE / "bag", SAMPLE / "map.yaml", config, "online", events=dark(0.6, 9.0, 14.0))
+    learned = [d for d in result.decisions if d.kind == "learned"]
+    doubted, revised = ({d.step for d in learned if d.reason == why} for why in ("doubted", "contradicted"))
+    assert len(doubted) > 40
+    assert len(doubted & revised) > 0.9 * len(doubted)
+
+
 @pytest.mark.slow
 def test_no_landmark_is_named_by_a_pose_that_sightings_overrule():
     """Wheels alone slip on ice: what its only marker says of the robot's wrong place is no evidence against it."""
