@@ -13,7 +13,7 @@ from fgloc import se2
 from fgloc.config import Config
 from fgloc.estimation.integrity import Fix, ProtectionLevels
 from fgloc.estimation.log import JUMP, mode_decisions, place_decision, segment_decision
-from fgloc.estimation.motion import MotionJudge
+from fgloc.estimation.motion import MotionJudge, in_silence
 from fgloc.estimation.place import InitialPose
 from fgloc.estimation.sightings import JudgedSightings, SightingJudge
 from fgloc.estimation.tracking import Tracking
@@ -159,6 +159,8 @@ class Localizer:
         elif not self.tracking.initializing and self.tracking.is_unlocalized(self.estimator.belief):
             self.sightings.modes.forget()
             self.tracking.get_lost()
+        elif self.tracking.lost and not self.tracking.is_unlocalized(self.estimator.belief):
+            self.tracking.go_on()
 
     def _begin_segment(self, step: Step) -> None:
         if self._keep_all:
@@ -366,7 +368,7 @@ class Recorder:
         clock_variance = self._clock_sigma_s**2 + self._motion.sources.clock_sigma_s(frame) ** 2
         by_clock = np.asarray(np.outer(twist, twist) * clock_variance)
         carried, around = tracking.kidnapped(self._sightings.association.contradicting, belief)
-        frame.added_cov = by_clock + tracking.doubt_cov(belief) + _in_silence(frame.readings)
+        frame.added_cov = by_clock + tracking.doubt_cov(belief) + in_silence(frame.readings)
         frame.carried_cov = carried * around  # of a mixture of two Gaussians, the second one wide
         if frame.mode is Mode.LOST:
             frame.added_cov = frame.added_cov + tracking.lost_cov(belief)
@@ -436,14 +438,6 @@ class Recorder:
             for f in frames
         }
         return [_with_cov(replace(e, mode=mode), covs.get(e.stamp_ns)) for e in estimates]
-
-
-def _in_silence(readings: MotionReadings) -> FloatArray | float:
-    """Covariance ``(3, 3)`` of a pose within a silence of the wheels that nothing else tells; 0: it is in none."""
-    wheels = readings.wheels
-    if wheels is None or wheels.end_variance is None or readings.learned is not None or readings.beside:
-        return 0.0
-    return np.diag(wheels.end_variance * (1.0, 1.0, readings.gyro is None))
 
 
 def _with_cov(estimate: Estimate, cov: FloatArray | None) -> Estimate:

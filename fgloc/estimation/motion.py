@@ -177,6 +177,7 @@ class MotionSources:
         self._known_rest = 10.0 * config.wheels.noise.xy_per_sqrt_s**2
         self._wheels, self._learned, self._joint = sensors.wheels, sensors.learned, sensors.joint
         self.gyro, self.attitude = sensors.gyro, sensors.attitude
+        self._wheels.turn_known = self.gyro is not None
         self.beside: OdometriesBeside | None = None  # set by the judge, which compares them
         self._alone = TurnComparison(config) if sensors.alone and sensors.gyro is not None else None
         self._turn: Turn | None = None  # by the gyro, of the step that was read last
@@ -264,6 +265,19 @@ class MotionSources:
         if readings.wheels is not None or readings.learned is not None or readings.beside:
             self._silent_s = 0.0
         return readings
+
+    @property
+    def measured_again(self) -> Sequence[Step]:
+        """Earlier steps whose motion is known anew since the newest one was read (`WheelMotion.measured_again`)."""
+        return self._wheels.measured_again
+
+    def read_again(self, step: Step, readings: MotionReadings) -> MotionReadings:
+        """Readings of an earlier step with the wheels' motion as it is known now."""
+        reported = self._wheels.measure(step)
+        if reported is None or readings.wheels is None:
+            return readings
+        by = self._wheels.derivatives(step, reported, self.factors.installation.index)
+        return replace(readings, wheels=self.factors.installed(reported, by))
 
     def _at_rest(self, step: Step, wheels: MotionMeasurement | None) -> bool:
         """Whether the robot rests by its wheels and gyro; False for commands in place of wheels."""
@@ -856,6 +870,7 @@ class MotionJudge:
 
     def judge(self, step: Step, readings: MotionReadings) -> JudgedMotion:
         """Test the sources against each other, back to where they began to differ, and combine what is left of them."""
+        self._end_silence()
         verdict = self._faults.judge(step, readings)
         revisions = self._revise(verdict)
         if self.sources.beside is not None:
@@ -953,6 +968,32 @@ class MotionJudge:
         left_out_s = self._faults.left_out_s
         return (left_out_note(left_out_s),) if left_out_s > 0.0 else ()
 
+    def _end_silence(self) -> None:
+        """Give the steps within a silence of the wheels the motion that the reading after it tells.
+
+        That they were taken to stand, and a gyro turned, was no slip.
+        """
+        again, frames = self.sources.measured_again, []
+        for frame in reversed(self._estimator.log.keyframes.values()):
+            if not again or frame.stamp_ns < again[0].stamp_ns:
+                break
+            if frame.step in again and frame.prior is None and frame.readings.wheels is not None:
+                frames.append(frame)
+        if any(frame.sightings for frame in frames):  # which tell more of the way than the ends of the silence
+            return
+        changed: dict[int, Sequence[MotionMeasurement]] = {}
+        for frame in frames:
+            assert frame.step is not None
+            rejected = {
+                name: why for name, why in frame.budget.rejected.items() if name != "wheels" or why in (KNOWN, _CARRIED)
+            }
+            frame.budget = replace(frame.budget, rejected=rejected, scale=1.0)
+            frame.readings = self.sources.read_again(frame.step, frame.readings)
+            frame.added_cov = frame.added_cov + in_silence(frame.readings)
+            if motions := frame.budget.combine(frame.readings, self.sources.rules):
+                changed[frame.k] = motions
+        self._estimator.revise(changed, anew=True)
+
     def _revise(self, verdict: FaultVerdict) -> tuple[Decision, ...]:
         """Combine the motion of earlier steps anew, back to where the sources began to differ.
 
@@ -986,6 +1027,14 @@ class MotionJudge:
                 rows += motion_decisions(k, motions, frame.readings, budget, verdict.nis, verdict.threshold)
         self._estimator.revise(changed)
         return tuple(rows)
+
+
+def in_silence(readings: MotionReadings) -> FloatArray | float:
+    """Covariance ``(3, 3)`` of a pose within a silence of the wheels that nothing else tells; 0: it is in none."""
+    wheels = readings.wheels
+    if wheels is None or wheels.end_variance is None or readings.learned is not None or readings.beside:
+        return 0.0
+    return np.diag(wheels.end_variance * (1.0, 1.0, readings.gyro is None))
 
 
 def _carried() -> NoiseBudget:

@@ -166,16 +166,27 @@ class Estimator(ABC):
         )
         return self._take(frame)
 
-    def revise(self, motions: Mapping[int, Sequence[MotionMeasurement]]) -> None:
+    def revise(self, motions: Mapping[int, Sequence[MotionMeasurement]], anew: bool = False) -> None:
         """Replace the motion factors of keyframes that the estimator still holds; the newest belief follows.
 
         Older ones are changed in the log alone, for the batch smoother.
+
+        Args:
+            motions: those of each keyframe.
+            anew: they are so different that the poses since then are predicted anew.
         """
         for k, changed in motions.items():
             self.log.keyframes[k].motions = tuple(changed)
         if motions and self.belief is not None:
-            self._solve_again(sorted(motions))
+            if anew:
+                self._drive_again(min(motions))
+            else:
+                self._solve_again(sorted(motions))
             self._adopt(self.newest.belief)
+
+    def _drive_again(self, first: int) -> None:
+        """Solve anew from keyframe ``first`` on, as the motions since then are other ones."""
+        self._solve_again([first])
 
     def correct(self, belief: PoseWithCovariance, landmark_id: int) -> None:
         """Go on from another newest pose, which owes nothing to a landmark; its sightings are only logged."""
@@ -732,6 +743,15 @@ class IncrementalEstimator(Estimator):
         except _GTSAM_ERRORS:  # what the window knew is in the belief
             self.rebuilt += 1
             newest.belief = self._replayed([newest], initial)
+
+    def _drive_again(self, first: int) -> None:
+        for k in range(first, self.k + 1):
+            before, frame = self.log.keyframes.get(k - 1), self.log.keyframes[k]
+            if before is not None and frame.prior is None and not frame.sightings:
+                known = before.belief.installation or self.installed
+                frame.belief = predict(before.belief, known, self.factors.installation, frame.motions)
+        if self._backend is not None:
+            self._build_again()
 
     def _keep_slots(self, frame: Keyframe, slots: Sequence[int], prior: PoseWithCovariance | None = None) -> None:
         """Remember where the motion factors of a keyframe are, while both of their poses are in the window."""

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from exact import exact
 from motion_models import make_card, make_tensors
-from robot_world import SPEED, START_NS, TURN, Chain, World, beacons
+from robot_world import SPEED, START_NS, TURN, Chain, World, beacons, nees, position_error, room
+from robot_world import config as world_config
 from scipy.stats import chi2
 
 from fgloc import se2
@@ -30,7 +31,7 @@ from fgloc.sensors.learned.network import JointCalibration
 from fgloc.sensors.learned.sensor import LearnedMotion, load_model, save_model
 from fgloc.sensors.wheels.motion import WheelMotion
 from fgloc.stats import GATE, chi2_bound
-from fgloc.types import ControlEvent, MotionMeasurement, MotionReadings, Step, by_class
+from fgloc.types import ControlEvent, Mode, MotionMeasurement, MotionReadings, Step, by_class
 
 W, N = np.diag([0.012, 0.004, 0.02]) ** 2, np.diag([0.008, 0.003, 0.03]) ** 2
 L_W, L_N = np.linalg.cholesky(W), np.linalg.cholesky(N)
@@ -351,3 +352,18 @@ def test_wheels_of_unequal_size_are_no_slip_to_the_comparison_with_a_gyro(per_m_
     corrected = turns.corrected(turned, 0.2, 0.0, 0.0, 0.02**2)
     share = 0.02**2 / (0.02**2 + (per_m_sigma * 0.5) ** 2)
     assert corrected.yaw == pytest.approx(turned.yaw - (share * turned.yaw if learned else 0.0), rel=0.02)
+
+
+@pytest.mark.parametrize("kind", ["fixed_lag", "isam2", "ekf"])
+@pytest.mark.parametrize("silent_s", [1.0, 3.0])
+def test_a_silence_of_the_wheels_is_made_up_for_when_they_speak_again(kind, silent_s):
+    """Nothing is seen then, nor for two seconds more; before, the steps of the silence had no motion."""
+    again = 6.0 + silent_s
+    world = World(room(), seed=1, seconds=again + 1.5, dumb=((6.0, again),), blind=((6.0, again + 2.0),))
+    settings = world_config(estimator={"kind": kind})
+    last = Chain(settings, room()).run(world.events())[-1]
+    assert last.stamp_ns > START_NS + (again + 1.0) * 1e9
+    assert last.mode is not Mode.LOST
+    assert position_error(last, world.truth(last.stamp_ns)) < 0.05
+    assert np.sqrt(np.diag(last.cov)).max() < 0.1
+    assert nees(last, world.truth(last.stamp_ns)) < 12.0

@@ -337,11 +337,56 @@ def test_a_pose_within_a_long_silence_is_as_unsure_as_the_way_and_its_end_as_sur
 
 
 def test_steps_that_ended_within_a_gap_are_not_followed_by_their_share_of_the_way(drive):
-    events = [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 20, 20) if not 6.0 < t < 15.0]
-    seen = [range_bearing(t) for t in times(5.0, 16.0, 5)]
+    events = [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 24, 20) if not 6.0 < t < 18.0]
+    seen = [range_bearing(t) for t in times(5.0, 19.0, 5)]
     steps = run(stepper(), in_order_of_receipt(events, seen))
     _, _, wheels = total(steps, WheelsConfig())
     assert wheels.rejections["wheels.silence"] > 10
+
+
+@pytest.mark.parametrize("last_s", [7.4, 9.0, 15.0])
+def test_steps_that_ended_within_a_gap_of_seconds_are_measured_again_after_it(drive, last_s):
+    events = [odometry(t, drive.pose(t), drive.twist(t)) for t in times(0.1, 20, 20) if not 6.0 < t < last_s]
+    seen = [range_bearing(t) for t in times(5.0, 18.0, 5)]
+    steps = run(stepper(), in_order_of_receipt(events, seen))
+    wheels, again = WheelMotion(WheelsConfig()), []
+    for step in steps:
+        wheels.measure(step)
+        again += wheels.measured_again
+    assert {round(step.stamp_ns * 1e-9, 1) for step in again} == {round(t, 1) for t in times(6.2, last_s - 0.1, 5)}
+    pose = np.zeros(3)
+    for m in filter(None, map(wheels.measure, steps)):
+        pose = se2.compose(pose, m.motion)
+    assert pose == pytest.approx(drive.motion(steps[0].stamp_ns, steps[-1].stamp_ns), abs=0.02)
+    assert not wheels.rejections
+    assert not any("no wheel motion" in note for note in wheels.notes)
+
+
+def test_wheels_tell_way_and_turn_of_a_gap_and_not_the_place_after_it():
+    """Straight on for two seconds, then a quarter to the left, or the other way round; a gyro tells which."""
+    off, sigmas = [], {}
+    for known in (False, True):
+        for first in (True, False):
+            twists = [(0.4, 0.0) if (t < 8.0) == first else (0.4, 0.25 * math.pi) for t in np.arange(6.0, 10.0, 0.02)]
+            weave = [(0.4, 0.8 * math.sin(2.0 * t)) for t in np.arange(0.0, 6.0, 0.02)]
+            pose, left, right, events = np.zeros(3), 0.0, 0.0, []
+            for k, (v, w) in enumerate(weave + twists + weave[:50]):
+                if not 300 < k < 500:
+                    events.append(joints(0.1 + 0.02 * k, left / 0.05, right / 0.05, ("l", "r")))
+                if 300 <= k < 500:
+                    pose = se2.compose(pose, se2.exp(np.array([v, 0.0, w]) * 0.02))
+                left, right = left + (v - 0.15 * w) * 0.02, right + (v + 0.15 * w) * 0.02
+            geometry = {"left_joint": "l", "right_joint": "r", "left_radius": 0.05, "right_radius": 0.05, "track": 0.3}
+            wheels = WheelMotion(WheelsConfig(source="ticks", **geometry))
+            wheels.turn_known = known
+            steps = run(stepper(), events)
+            for step in steps:
+                wheels.measure(step)
+            motion, cov = wheels.motion_between(steps[-1], ns(6.1), ns(10.1))
+            off.append(np.abs(se2.between(pose, motion)[:2]))
+            sigmas[known] = np.sqrt(np.diag(cov)[:2])
+    assert 0.2 < np.max(off) < 3.0 * sigmas[False].min()
+    assert sigmas[True].max() < 0.1
 
 
 def test_the_heading_of_a_pose_of_few_noisy_messages_is_not_doubted():

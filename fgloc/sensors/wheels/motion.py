@@ -15,7 +15,7 @@ from fgloc import se2
 from fgloc.config import WheelsConfig
 from fgloc.sensors.base import FoundRow, InstallationState, MotionInstallation, Parameter, Rank
 from fgloc.sensors.wheels.driven import DriveTrack, TicksTrack
-from fgloc.sensors.wheels.tracks import CommandTrack, OdometryTrack, Track, TwistTimeline
+from fgloc.sensors.wheels.tracks import AGAIN_NS, CommandTrack, OdometryTrack, Track, TwistTimeline
 from fgloc.types import FloatArray, MotionMeasurement, Setting, Step
 
 if TYPE_CHECKING:
@@ -209,6 +209,9 @@ class WheelMotion:
     Attributes:
         source: where the motion comes from: "ticks", "odometry" or "command"; empty before any message came.
         unknown_s: time [s] for which no motion of the wheels was known so far.
+        measured_again: earlier steps, in a silence of the wheels, whose motion the reading after it has told; `measure`
+            gives it.
+        turn_known: whether a gyro tells the turn within a silence.
 
     ``rejections`` counts wheels.silence, wheels.pose_reset (an odometry that jumped) and wheels.encoder_reset.
     """
@@ -239,6 +242,10 @@ class WheelMotion:
         ]  # best first
         self._all = tuple(self._tracks)
         self._taken: WeakKeyDictionary[Step, MotionMeasurement | None] = WeakKeyDictionary()
+        self._beyond: deque[tuple[Step, float]] = deque()  # ended after the newest reading; time unknown in each
+        self._read_ns = 0  # end of the timeline then
+        self.measured_again: list[Step] = []  # by the newest call of `measure`
+        self.turn_known = False
 
     @property
     def by_twist(self) -> bool:
@@ -288,18 +295,48 @@ class WheelMotion:
         if step in self._taken:
             return self._taken[step]
         self._ingest(step)
+        self.measured_again = []
         measured = None
         if self._tracks and step.dt > 0.0:
             timeline = self._active(step)
-            motion, cov, unknown_s = self._integrate(timeline, step.start_ns, step.stamp_ns)
-            start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns
-            within = timeline.variance_within(start_ns, end_ns, bool(step.sightings or step.sensed))
-            if unknown_s > 0.0:
-                self.unknown_steps += 1
-                self.unknown_s += unknown_s
-            measured = MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov, end_variance=within)
+            self._measure_again(timeline)
+            measured, unknown_s = self._measured(timeline, step)
+            self._count_unknown(unknown_s)
+            if step.stamp_ns - self._delay_ns > timeline.end_ns:
+                while self._beyond and step.stamp_ns - self._beyond[0][0].stamp_ns > AGAIN_NS:
+                    self._beyond.popleft()
+                self._beyond.append((step, unknown_s))
+                self._read_ns = timeline.end_ns
         self._taken[step] = measured
         return measured
+
+    def _measured(self, timeline: TwistTimeline, step: Step) -> tuple[MotionMeasurement, float]:
+        """Motion of a step, and the time [s] of it without knowledge."""
+        motion, cov, unknown_s = self._integrate(timeline, step.start_ns, step.stamp_ns)
+        start_ns, end_ns = step.start_ns - self._delay_ns, step.stamp_ns - self._delay_ns
+        within = timeline.variance_within(start_ns, end_ns, bool(step.sightings or step.sensed))
+        return MotionMeasurement("wheels", step.start_ns, step.stamp_ns, motion, cov, end_variance=within), unknown_s
+
+    def _count_unknown(self, seconds: float, sign: int = 1) -> None:
+        if seconds > 0.0:
+            self.unknown_steps += sign
+            self.unknown_s += sign * seconds
+
+    def _measure_again(self, timeline: TwistTimeline) -> None:
+        """Measure the steps that ended in a silence again, once a reading has come that tells the motion in it."""
+        if not self._beyond or timeline.end_ns <= self._read_ns:
+            return
+        beyond, self._beyond = self._beyond, deque()
+        if not any(unknown_s for _, unknown_s in beyond):
+            return
+        again = [(step, *self._measured(timeline, step)) for step, _ in beyond]
+        if sum(unknown_s for *_, unknown_s in again) >= sum(unknown_s for _, unknown_s in beyond):
+            return
+        for (step, measured, now_s), (_, before_s) in zip(again, beyond, strict=True):
+            self._taken[step] = measured
+            self._count_unknown(before_s, -1)
+            self._count_unknown(now_s)
+            self.measured_again.append(step)
 
     def motion_between(self, step: Step, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
         """Motion between two times near the step, forwards or backwards.
@@ -369,13 +406,15 @@ class WheelMotion:
         return by
 
     def _integrate(self, timeline: TwistTimeline, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, float]:
-        return timeline.integrate(start_ns - self._delay_ns, end_ns - self._delay_ns, self._config.noise)
+        span = start_ns - self._delay_ns, end_ns - self._delay_ns
+        return timeline.integrate(*span, self._config.noise, self.turn_known)
 
     def _ingest(self, step: Step) -> None:
         if step.segment != self._segment:
             for track in self._tracks:
                 track.reset()
             self._segment = step.segment
+            self._beyond.clear()
         for track in self._tracks:
             track.ingest(step)
 

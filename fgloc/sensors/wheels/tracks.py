@@ -38,6 +38,20 @@ def _silent_spread(seconds: float) -> float:
     return 2.0 * _SILENT_TAU_S * (seconds + _SILENT_TAU_S * math.expm1(-seconds / _SILENT_TAU_S))
 
 
+def _shape_density(twist: Twist | None, usual: tuple[float, float], seconds: float) -> float:
+    """Variance [m²/s] of the place after a silence over which wheels tell way and turn, but not where they turned.
+
+    The heading between is off by a Brownian bridge, of a turn rate as usual that changes within `_SILENT_TAU_S`; its
+    integral has a twelfth of the variance of the end of the free process, times the square of the time. The place is
+    off by no more than the way.
+    """
+    if twist is None:
+        return 0.0
+    speed, turn = max(math.hypot(*twist[:2]), usual[0]), max(abs(twist[2]), usual[1])
+    share = seconds / (seconds + _SILENT_TAU_S)  # over less time the turn rate hardly changes
+    return speed**2 * min(2.0 * _SILENT_TAU_S * (turn * seconds) ** 2 * share / 12.0, 0.25 * seconds)
+
+
 class TwistTimeline:
     """Piecewise constant body twist, contiguous from its first stamp on; pieces may be unknown.
 
@@ -52,8 +66,8 @@ class TwistTimeline:
         self._tail_by: FloatArray | None = None
         self._starts: list[int] = []
         self._pieces: list[Twist | None] = []  # None: unknown
-        # by start, where only the ends are known: mean speed and turn rate before
-        self._bridged: dict[int, tuple[float, float]] = {}
+        # by start, where only the ends are known: mean speed and turn rate before, and variance of the place a second
+        self._bridged: dict[int, tuple[float, float, float]] = {}
         self._silence = (0, 0)  # start and end of the newest of them whose ends do not tell the way between
         self._seen_ns = 0  # until when it was seen
         self._known_s = self._way = self._turned = 0.0  # over all pieces: time [s], path [m], turn [rad]
@@ -68,6 +82,11 @@ class TwistTimeline:
         """Stamp at which the timeline begins [ns]; None if it holds nothing."""
         return self._starts[0] if self._starts else None
 
+    @property
+    def end_ns(self) -> int:
+        """Stamp at which its last piece ends [ns]."""
+        return self._end
+
     def begin(self, stamp_ns: int) -> None:
         """Forget all and start here."""
         self._starts.clear()
@@ -78,7 +97,14 @@ class TwistTimeline:
         self._pieces.append(None)
         self._end = self._tail_end = stamp_ns
 
-    def extend(self, end_ns: int, twist: Twist | None, bridged: bool = False, by: FloatArray | None = None) -> None:
+    def extend(
+        self,
+        end_ns: int,
+        twist: Twist | None,
+        bridged: bool = False,
+        by: FloatArray | None = None,
+        place_told: bool = True,
+    ) -> None:
         """Add a piece from the last one's end to ``end_ns``.
 
         Args:
@@ -86,12 +112,15 @@ class TwistTimeline:
             twist: constant over it; None: not known.
             bridged: only its ends were measured: the way between is as noisy as that of a robot that went on as usual.
             by: derivatives ``(3, p)`` of the twist by the drive's parameters.
+            place_told: whether the ends of a bridged piece tell the place of its end, as those of a pose do; wheels
+                tell the whole way and turn, and not where on the way the robot turned.
         """
         if end_ns <= self._end:
             return
         seconds = (end_ns - self._end) * 1e-9
         if bridged and self._known_s > 0.0:
-            self._bridged[self._end] = self._way / self._known_s, self._turned / self._known_s
+            usual = self._way / self._known_s, self._turned / self._known_s
+            self._bridged[self._end] = *usual, 0.0 if place_told else _shape_density(twist, usual, seconds)
             if twist is not None and seconds > _SILENT_TAU_S:
                 told = math.hypot(twist[0], twist[1]) * seconds < _BRIDGED_M and abs(twist[2]) * seconds < _BRIDGED_RAD
                 self._silence, self._seen_ns = (0, 0) if told else (self._end, end_ns), self._end
@@ -122,12 +151,15 @@ class TwistTimeline:
         self._tail, self._tail_by = twist, by
         self._tail_end = max(end_ns, self._end)
 
-    def integrate(self, start_ns: int, end_ns: int, noise: NoiseDensity) -> tuple[FloatArray, FloatArray, float]:
+    def integrate(
+        self, start_ns: int, end_ns: int, noise: NoiseDensity, turn_known: bool = False
+    ) -> tuple[FloatArray, FloatArray, float]:
         """Motion between two times, ``start_ns <= end_ns``.
 
         The covariance is that of a Wiener process along the exact path (xx along the body's x axis, yy across), so
         that it does not depend on how the time is cut. Where the twist is unknown the robot is taken to stand, with the
-        spread of a velocity as large as the largest yet seen that changes within 2 s.
+        spread of a velocity as large as the largest yet seen that changes within 2 s. With ``turn_known`` something
+        else measures the turn, also where wheels tell only the whole of it.
 
         Returns:
             ``T_start_end`` ``(3,)``, its right-perturbation covariance ``(3, 3)``, and the time without knowledge [s].
@@ -148,13 +180,13 @@ class TwistTimeline:
                 unknown += seconds
                 continue
             vx, vy, w = twist
-            speed, turn = math.hypot(vx, vy), abs(w)
+            speed, turn, shape = math.hypot(vx, vy), abs(w), 0.0
             if origin_ns in self._bridged:
-                usual = self._bridged[origin_ns]
-                speed, turn = max(speed, usual[0]), max(turn, usual[1])
+                usual_speed, usual_turn, density = self._bridged[origin_ns]
+                speed, turn, shape = max(speed, usual_speed), max(turn, usual_turn), 0.0 if turn_known else density
             ahead, aside = (abs(vx), abs(vy)) if self._slides else (speed, 0.0)
-            qx = x2m * ahead + y2m * aside + xy2r * turn + xy2s
-            qy = y2m * ahead + x2m * aside + xy2r * turn + xy2s
+            qx = x2m * ahead + y2m * aside + xy2r * turn + xy2s + shape
+            qy = y2m * ahead + x2m * aside + xy2r * turn + xy2s + shape
             qt = t2m * speed + t2r * turn + t2s
             cuts = int(abs(w) * seconds / _MAX_TURN) + 1
             h = seconds / cuts
@@ -271,6 +303,7 @@ MAX_SPEED, MAX_TURN = 10.0, 20.0  # m/s, rad/s: a difference of two readings bey
 _FIRST_USUAL_S = 0.05  # between readings, before any came
 _MOST_USUAL = 20  # newest of which it is the mean
 MAX_GAP_S = 5.0  # over a longer gap no difference is used: the robot may have been restarted
+AGAIN_NS = 10_000_000_000  # steps that ended in a silence are measured again after it, if it was no longer
 
 
 class Track:
@@ -285,6 +318,7 @@ class Track:
 
     kind = ""
     events: type[MotionEvent] = MotionEvent  # that it reads
+    place_told = False  # whether two readings tell the motion between them, however long it was and where it turned
 
     def __init__(self, config: WheelsConfig) -> None:
         """Start with nothing received."""
@@ -358,7 +392,8 @@ class Track:
             self.timeline.begin(stamp_ns)
         elif twist is not None:
             by = None if by is None else self._true_by(twist, by)
-            self.timeline.extend(stamp_ns, self._true(twist), stamp_ns - self._last_ns > self._hold_ns, by)
+            bridged = stamp_ns - self._last_ns > self._hold_ns
+            self.timeline.extend(stamp_ns, self._true(twist), bridged, by, self.place_told)
         else:
             if held is not None:
                 self.timeline.extend(min(stamp_ns, self._last_ns + self._hold_ns), self._true(held))
@@ -449,6 +484,7 @@ class OdometryTrack(Track):
 
     kind = "odometry"
     events = OdometryEvent
+    place_told = True
 
     def __init__(self, config: WheelsConfig) -> None:
         """Start with nothing received."""
@@ -506,8 +542,8 @@ class OdometryTrack(Track):
     def _bridges(self, pose: Pose) -> bool:
         """Whether the pose's difference is the motion over a long gap: it is used, and was not begun anew.
 
-        Steps that ended within the gap had no motion. Then only a small difference is used: the last piece of the gap
-        would be given its share of a way that the steps before do not have.
+        Steps that ended within the gap had no motion. Those of some seconds are measured again; after a longer gap only
+        a small difference is used: its last piece would be given its share of a way that the steps before do not have.
         """
         assert self._last_ns is not None
         before = self._pose or pose
@@ -516,7 +552,7 @@ class OdometryTrack(Track):
         restarted = math.hypot(*pose[:2]) < _BEGINS_M < math.hypot(*before[:2])
         dx, dy, dyaw = _difference(before, pose)
         little = math.hypot(dx, dy) < _BRIDGED_M and abs(dyaw) < _BRIDGED_RAD
-        whole = self._given_ns <= self._last_ns + self._hold_ns
+        whole = self._given_ns <= self._last_ns + max(self._hold_ns, AGAIN_NS)
         return not insists and (little or whole) and not stands and not restarted
 
     def _between_poses(self, pose: Pose | None, mean: Twist | None, seconds: float) -> Twist | None:
