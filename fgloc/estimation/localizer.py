@@ -159,7 +159,7 @@ class Localizer:
         elif not self.tracking.initializing and self.tracking.is_unlocalized(self.estimator.belief):
             self.sightings.modes.forget()
             self.tracking.get_lost()
-        elif self.tracking.lost and not self.tracking.is_unlocalized(self.estimator.belief):
+        elif self.motion.sources.measured_again and not self.tracking.is_unlocalized(self.estimator.belief):
             self.tracking.go_on()
 
     def _begin_segment(self, step: Step) -> None:

@@ -979,8 +979,8 @@ class MotionJudge:
                 break
             if frame.step in again and frame.prior is None and frame.readings.wheels is not None:
                 frames.append(frame)
-        if any(frame.sightings for frame in frames):  # which tell more of the way than the ends of the silence
-            return
+        if any(f.sightings or f.readings.learned is not None or f.readings.beside for f in frames):
+            return  # they tell more of the way than the ends of the silence
         changed: dict[int, Sequence[MotionMeasurement]] = {}
         for frame in frames:
             assert frame.step is not None

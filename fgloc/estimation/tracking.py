@@ -181,9 +181,10 @@ class Tracking:
         self.global_search.hypotheses.reset()
 
     def go_on(self) -> None:
-        """End the search of a lost robot: the motion since it was lost has become known."""
-        self.lost = self.global_search.initializing = False
-        self.global_search.forget()
+        """End the search if the robot was lost: the motion since then has become known."""
+        if self.lost:
+            self.lost = self.global_search.initializing = False
+            self.global_search.forget()
 
     def is_unlocalized(self, belief: PoseWithCovariance | None) -> bool:
         """Whether the pose is so little known that only a search of the map can find it again."""
