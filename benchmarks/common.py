@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -65,7 +66,10 @@ def main(measure: Callable[[bool], Iterable[Row]], description: str, argv: Seque
     parser.add_argument("--quick", action="store_true", help="a smoke run; its figures are not to be quoted")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows as JSON")
     arguments = parser.parse_args(argv)
-    rows = list(measure(arguments.quick))
+    rows = []
+    for row in measure(arguments.quick):
+        rows.append(row)
+        print(*_cells(row)[:2], file=sys.stderr, flush=True)  # of a run that is interrupted these are there
     print(table(rows))
     if arguments.quick:
         print("quick run: not to be quoted")
