@@ -236,6 +236,7 @@ class Sanity:
                 self._seen_ns.append(stamp_ns)
                 self._ids.append(landmark_id)
                 self._seen.extend((*place, *sensor, sigma))
+        joined &= not self._wheels.measured_again  # the steps before were taken to stand, and the estimate knows better
         return self.watch.checked(step, measured, joined, estimate, list(self._surveyed(step, seen)))
 
     def begin_anew(self) -> None:

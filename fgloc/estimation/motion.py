@@ -992,7 +992,9 @@ class MotionJudge:
             frame.added_cov = frame.added_cov + in_silence(frame.readings)
             if motions := frame.budget.combine(frame.readings, self.sources.rules):
                 changed[frame.k] = motions
-        self._estimator.revise(changed, anew=True)
+        if changed:
+            self._estimator.revise(changed, anew=True)
+            self._faults.reset()
 
     def _revise(self, verdict: FaultVerdict) -> tuple[Decision, ...]:
         """Combine the motion of earlier steps anew, back to where the sources began to differ.

@@ -231,7 +231,7 @@ def test_where_wheels_have_slipped_in_this_run_the_dark_is_bounded_more_widely()
 
 
 def test_in_a_long_darkness_several_slips_add_up():
-    """Of 400 and 1600 s, with 4 and 16 slips that are to be expected beside the one that may be there."""
+    """In 400 and 1600 s, 4 and 16 slips are to be expected beside the one that may be there."""
     short, long = (bound(since_fix_s=seconds).bound[0] for seconds in (400.0, 1600.0))
     assert long / short == pytest.approx(math.sqrt(17.0 / 5.0), rel=0.05)
 

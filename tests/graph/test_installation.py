@@ -72,7 +72,7 @@ def test_a_covariance_of_the_map_is_the_prior_of_its_landmark():
 
 
 def test_markers_of_a_board_that_are_states_are_displaced_together():
-    """Of a board of three, the second is no state: it was never given a size, say."""
+    """The second marker of the board is no state, as if the map had not given its size."""
     rng = np.random.default_rng(4)
     derivative, root = rng.normal(size=(18, 6)), 0.01 * rng.normal(size=(6, 6))
     board = BoardPrior((7, 8, 9), derivative, root @ root.T, np.full(6, 1e-6))
