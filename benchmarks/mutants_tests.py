@@ -27,7 +27,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("estimation", "graph", "calibration", "diagnosis", "live")
-_FOLDERS = ("estimation", "graph", "calibration", "live", "diagnosis", "faults", "replay", "test_localizer.py")
+_FOLDERS = (
+    *("estimation", "graph", "calibration", "live", "diagnosis", "faults", "replay", "drives", "sensors", "cli"),
+    *("ablation", "evaluation", "fuzz", "test_localizer.py", "test_api.py"),
+)
 _LIBRARIES = ("numpy", "scipy.stats", "scipy.optimize", "scipy.spatial", "gtsam", "cv2", "pydantic", "yaml")
 _LONGEST_S = 6.0  # of processor time, traced: longer tests are left out
 _VARIANTS = 3  # of a test with parameters
