@@ -209,6 +209,33 @@ def test_a_broken_convention_is_named_first(tmp_path, case):
         assert abs(found[0].value - value) < 0.05 * value + 5.0 * found[0].sigma
 
 
+@pytest.mark.parametrize(
+    ("wrong", "settings", "code", "lines"),
+    [
+        (Broken(), {"gyro": {"scale": -1.0}}, "imu.sign", {"expert.gyro.scale": "1.0"}),
+        (Broken(turn=-1.0), {}, "wheels.sign", {"wheels.scale_omega": "-1.0"}),
+        (
+            Broken(joint_angle=1.0),
+            {"wheels": GEOMETRY | {"left_joint": WHEELS[1], "right_joint": WHEELS[0]}},
+            "wheels.sign",
+            {"wheels.left_joint": WHEELS[0], "wheels.right_joint": WHEELS[1]},
+        ),
+        (  # a robot that seems to look back
+            Broken(joint_angle=1.0, joint_signs=(-1.0, -1.0)),
+            {"wheels": GEOMETRY},
+            "wheels.reversed",
+            {"wheels.left_radius": "-0.05", "wheels.right_radius": "-0.05"},
+        ),
+    ],
+    ids=["gyro", "odometry", "sides exchanged", "wheels backwards"],
+)
+def test_of_two_that_turn_in_opposite_directions_the_landmarks_tell_which_is_wrong(
+    tmp_path, wrong, settings, code, lines
+):
+    found = conventions_of(record(tmp_path, wrong), config_of(settings))
+    assert [(f.code, f.lines) for f in found] == [(code, lines)]
+
+
 def test_a_sound_recording_has_none(tmp_path):
     bag = record(tmp_path, Broken())
     assert not conventions_of(bag, Config())
