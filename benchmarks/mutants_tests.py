@@ -63,9 +63,9 @@ class Tree:
         command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
         names = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
         for name in filter(None, names.split("\0")):
-            if (ROOT / name).is_file():
+            if (ROOT / name).is_symlink() or (ROOT / name).is_file():  # the samples are a link to a folder
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(ROOT / name, folder / name)
+                shutil.copy2(ROOT / name, folder / name, follow_symlinks=False)
         for name in _LIBRARIES:
             importlib.import_module(name)
         assert not any(name.partition(".")[0] == "fgloc" for name in sys.modules), "each process imports its own fgloc"
