@@ -1,12 +1,13 @@
 """Share of small changes of the deciding code that the tests notice.
 
-mutants.caught, mutants.caught.PACKAGE   of the mutants drawn, in the tests of what decides (see `mutants_tests`)
+mutants.caught, mutants.caught.PACKAGE   of the mutants drawn, in the tests that execute them (see `mutants_tests`)
+mutants.false_alarms                     of the first twenty: share whose tests fail, or are late, on the unchanged file
 
 A mutant is one change of one statement: a comparison turned or shifted, ``and`` for ``or``, a condition negated, ``-``
 for ``+``, a constant times ten or zero, a keyword dropped, a neutral result, a statement, ``continue`` or ``break``
-removed. Texts, types, assertions, errors and logs stay. For each, the quick tests that execute the line run in a copy
-of the working tree; it is caught if one fails or takes five times its duration. Maps of the tests and finished mutants
-are kept (``FGLOC_BENCHMARK_CACHE``), so that an interrupted run goes on.
+removed. Texts, types, assertions, errors and logs stay. For each, the quickest tests that execute the line run in a
+copy of the working tree; it is caught if one fails, or if they take five times their durations. Maps of the tests and
+finished mutants are kept (``FGLOC_BENCHMARK_CACHE``), so that an interrupted run goes on.
 
 ``--only PACKAGE``, ``--seed N`` and ``--count N`` draw other mutants; ``--quick`` draws ten; ``--kept`` runs only
 tests whose map is kept.
@@ -27,10 +28,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import common, mutants_tests
-from benchmarks.common import Row
+from benchmarks.common import Row, mean_row
 from benchmarks.mutants_tests import PACKAGES, ROOT, TestMap, Tree, caught, hash_of, map_of_tests
 
 _COUNT, _QUICK = 200, 10
+_UNCHANGED = 20  # mutants whose tests are also run on the unchanged file
 _TURNED: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -298,6 +300,12 @@ def judged(tree: Tree, mutants: Iterable[Mutant], tests: TestMap) -> Iterator[tu
         yield mutant, noticed, len(names)
 
 
+def false_alarm(tree: Tree, mutant: Mutant, tests: TestMap) -> bool:
+    """Whether the tests of a mutant "catch" the unchanged file too."""
+    names, unchanged = _tests_of(mutant, tests), (ROOT / mutant.file).read_text(encoding="utf-8")
+    return bool(names) and caught(tree, mutant.file, unchanged, tests, names)
+
+
 def main() -> None:
     """Draw mutants, run the tests of each, print the survivors and the table."""
     parser = argparse.ArgumentParser(add_help=False)
@@ -312,16 +320,18 @@ def main() -> None:
         of_package, noticed = Counter[str](), Counter[str]()
         with tempfile.TemporaryDirectory(prefix="fgloc-mutants-") as name:
             tree = Tree(Path(name).resolve())
-            survivors = []
-            for mutant, found, ran in judged(tree, mutants, map_of_tests(tree, own.kept)):
+            tests, survivors = map_of_tests(tree, own.kept), []
+            for mutant, found, ran in judged(tree, mutants, tests):
                 of_package[mutant.file.parts[1]] += 1
                 noticed[mutant.file.parts[1]] += found
                 if not found:
                     survivors.append(f"{mutant}  ({ran} tests)")
+            alarms = [false_alarm(tree, mutant, tests) for mutant in mutants[:_UNCHANGED]]
         print("\n".join(["survivors:", *survivors]))
         yield Row("mutants.caught", noticed.total() / of_package.total(), n=of_package.total())
         for package in of_package:
             yield Row(f"mutants.caught.{package}", noticed[package] / of_package[package], n=of_package[package])
+        yield mean_row("mutants.false_alarms", alarms)
 
     common.main(measure, __doc__ or "", others)
 
